@@ -9,7 +9,6 @@ def _exit_at_once(number: int, frame: object) -> None:
     os._exit(130)  # as `scenarios.terminal.INTERRUPTED`, which takes long to import
 
 
-
 def main() -> None:
     """Run the command line, or say which extra it needs."""
     signal.signal(signal.SIGINT, _exit_at_once)  # nothing has begun that an end could damage

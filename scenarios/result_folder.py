@@ -9,6 +9,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
+
+import msgspec
 
 from fleet.errors import FleetError
 from fleet.files import atomic_path, replace_folder
@@ -116,6 +119,15 @@ def check_file(out: Path, endings: Sequence[str], overwrite: bool, option: str =
     if out.is_dir():
         raise FleetError(f"Cannot write to '{out}': it is a folder.")
     check_overwrite(out, overwrite, option=option)
+
+
+def json_text(value: object) -> str:
+    """A value as indented JSON that ends with a line break; NaN becomes null, NumPy arrays and numbers plain ones."""
+
+    def plain(part: Any) -> object:  # an array or a number of NumPy
+        return part.tolist()
+
+    return msgspec.json.format(msgspec.json.encode(value, enc_hook=plain), indent=1).decode() + "\n"
 
 
 def _status(card: Path) -> str | None:

@@ -53,16 +53,10 @@ class Interrupted(FleetError):
 
 
 @contextmanager
-def progress_bar(
-    *,
-    kept: str = KEPT,
-    file: Path | None = None,
-    every_s: float = EVERY_S,
-    after_s: float = AFTER_S,
-) -> Iterator[Progress]:
+def progress_bar(*, kept: str = KEPT, file: Path | None = None) -> Iterator[Progress]:
     """Show a bar on standard error: what is going on, count and time left. Without a terminal, print lines.
 
-    Lines are printed when a stage begins that lasts longer than `after_s`, and every `every_s` in it.
+    Lines are printed when a stage begins that lasts longer than `AFTER_S`, and every `EVERY_S` in it.
 
     Args:
         kept: What an interruption leaves in the cache, as the beginning of a sentence; empty for nothing.
@@ -71,7 +65,7 @@ def progress_bar(
     Raises:
         Interrupted: Ctrl-C.
     """
-    shown = _Bar() if err_console.is_terminal else _Lines(every_s, after_s)
+    shown = _Bar() if err_console.is_terminal else _Lines()
     with shown:
         try:
             yield shown.report
@@ -114,9 +108,8 @@ class _Bar:
 class _Lines:
     """Lines on standard error, printed by a thread: a long step reports nothing meanwhile."""
 
-    def __init__(self, every_s: float, after_s: float) -> None:
+    def __init__(self) -> None:
         self.clock = StageClock()
-        self._every_s, self._after_s = every_s, after_s
         self._due_s, self._begun = float("inf"), False
         self._changed, self._ended = threading.Condition(), False
         self._thread = threading.Thread(target=self._print, name="progress", daemon=True)
@@ -138,7 +131,7 @@ class _Lines:
                 self._begun = stage.startswith(COUNTED)
                 if self._begun:
                     say(self.clock.first_line().removesuffix(" …"))
-                self._due_s = now_s + (self._every_s if self._begun else self._after_s)
+                self._due_s = now_s + (EVERY_S if self._begun else AFTER_S)
                 self._changed.notify()
 
     def _print(self) -> None:
@@ -151,14 +144,22 @@ class _Lines:
                 if self.clock.fraction < 1.0:
                     say(self.clock.line(now_s) if self._begun else self.clock.first_line())
                     self._begun = True
-                self._due_s = now_s + self._every_s
+                self._due_s = now_s + EVERY_S
 
 
 def print_json(value: object) -> None:
     """Print a value on standard output as JSON."""
-    import msgspec
+    from scenarios.result_folder import json_text
 
-    echo(msgspec.json.format(msgspec.json.encode(value), indent=1).decode())
+    echo(json_text(value), nl=False)
+
+
+def print_either(as_json: bool, value: object, *parts: RenderableType) -> None:
+    """Print a value as JSON, or else what shows it to people."""
+    if as_json:
+        print_json(value)
+    else:
+        out_console.print(*parts, sep="\n")
 
 
 WIDE = 200

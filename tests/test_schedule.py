@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from fleet.events import Event
 from scenarios.run.metrics import gini
-from scenarios.run.schedule import schedule
+from scenarios.run.records import schedule
 
 ARMS = ("arm_0", "arm_1")
 HORIZON_S = 1000.0

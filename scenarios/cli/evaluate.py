@@ -14,7 +14,7 @@ from fleet.bus.exchange.channel import Channel
 from fleet.errors import FleetError
 from fleet.fields import MAX_SEED, argument, option
 from scenarios.cli import options
-from scenarios.cli.from_fields import From, Given
+from scenarios.cli.options import From, Given
 from scenarios.result_folder import disk_errors, new_file
 from scenarios.spec.options import Budget, RunSpec, StudySpec
 from scenarios.table import TABLE_FILES

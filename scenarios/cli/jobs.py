@@ -10,7 +10,7 @@ from fleet.fields import argument, option
 from fleet.job import BOUNDS, DWELL_S
 from scenarios.cli import options
 from scenarios.table import Table
-from scenarios.terminal import out_console, print_json
+from scenarios.terminal import print_either
 
 if TYPE_CHECKING:  # the bus, which other commands do not load
     from fleet.bus.protocol.auction import JobStatus
@@ -116,9 +116,6 @@ def list_command(
     if unknown := sorted({*(names or ())} - {job.job for job in jobs}):
         near = nearest(unknown[0], [job.job for job in snapshot.jobs])
         raise FleetError(f"The fleet knows no job '{unknown[0]}'{near}")
-    if as_json:
-        print_json(jobs)
-        return
     now_s = max((arm.time_s or 0.0 for arm in snapshot.arms), default=0.0)
 
     def row(job: "JobStatus") -> tuple[str, ...]:
@@ -129,7 +126,7 @@ def list_command(
         return job.job, job.state.replace("_", " "), job.arm, cycles, age, end, job.reason
 
     head = ("job", "state", "arm", "cycles", "age", "end", "reason")
-    out_console.print(Table(head=head, rows=tuple(map(row, jobs)), numbers=False))
+    print_either(as_json, jobs, Table(head=head, rows=tuple(map(row, jobs)), numbers=False))
 
 
 def cancel_command(

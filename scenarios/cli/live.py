@@ -1,6 +1,7 @@
 """Commands that run a live fleet: up, `thermofleet arm run` and `thermofleet bus`."""
 
 from dataclasses import MISSING, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,13 +11,13 @@ from agents.registry import WRAPPERS_HELP, names_of
 from fleet.errors import FleetError
 from fleet.fields import MAX_SPEED, MIN_SPEED, argument, option
 from scenarios.cli import options
-from scenarios.cli.from_fields import From, Given
+from scenarios.cli.options import From, Given
 from scenarios.spec.options import PAGE_PORT, PORT, LiveSpec
 from scenarios.terminal import echo, out_console, say
 
 UNHEALTHY = 1
 """Exit code of `bus doctor`; 0 is a healthy fleet, and 2, as for every error of use, one that cannot be reached."""
-_TLS, _LISTEN = "Mutual TLS", "ros2 listen"
+_TLS = "Mutual TLS"
 
 
 def up_command(
@@ -152,7 +153,7 @@ def watch_command(
     scenario: str = option("Scenario of the fleet, to show the remaining time of the shift.", ""),
 ) -> None:
     """Watch temperatures, difficulty, jobs and the age of messages, until the fleet ends or Ctrl-C."""
-    from scenarios.live.watch import watch
+    from scenarios.show.watch import watch
     from scenarios.spec.load import load
 
     watch(endpoint, fleet, as_json=as_json, joints=joints, end_s=load(scenario).horizon_s if scenario else None)
@@ -194,10 +195,7 @@ def record_command(
 
     with until_stopped() as stop, BusClient(endpoint, fleet, backlog=BACKLOG, stopped=stop.is_set) as link:
         echo(f"ready record {endpoint}")
-
-        def connect() -> BusClient:
-            return BusClient(endpoint, fleet, timeout_s=CONNECT_S, backlog=BACKLOG)
-
+        connect = partial(BusClient, endpoint, fleet, timeout_s=CONNECT_S, backlog=BACKLOG)
         recorder = record(link, out, rotate_s=rotate, stopped=stop.is_set, connect=connect)
     missed = sum(count.missed for count in recorder.counts.values())
     kept = sum(count.kept for count in recorder.counts.values())
@@ -255,7 +253,6 @@ def gateway_command(
 
     shown = None
     if page:
-        from scenarios.live.gateway import LivePage
         from scenarios.show.page import three_js
         from scenarios.spec.load import load
 
@@ -272,47 +269,13 @@ def ros2_command(
     topic: str = argument("listen: topic of the arm's sensor_msgs/JointState, as /joint_states.", ""),
     endpoint: str = options.ENDPOINT,
     fleet: str = options.FLEET,
-    domain: int = option("The ROS 2 domain.", 0, low=0, high=232, env="ROS_DOMAIN_ID"),
-    router: str = option("Router of ROS 2 (rmw_zenohd), as tcp/127.0.0.1:7447; default: the fleet's router.", ""),
-    warning_c: float = option("Motor temperature at which a warning begins, °C.", 60.0, low=0, high=200),
-    error_c: float = option("bridge: motor temperature at which an error begins, °C.", 75.0, low=0, high=200),
-    humble: bool = option("bridge: for ROS 2 Humble, whose keys have no type hash.", False),
-    arm: str = option("Name of the arm in the fleet.", "real", is_name=True, panel=_LISTEN),
-    temperatures: str = option(
-        "Topic of the diagnostic_msgs/DiagnosticArray with its motor temperatures.", "", panel=_LISTEN
-    ),
-    hardware: str = option(
-        "Text before /JOINT in the hardware_id of these diagnostics; default: none.", "", panel=_LISTEN
-    ),
-    joints: str = option("Names of its joints in ROS 2, from joint 1 on.", "", panel=_LISTEN),
-    rate_hz: float = option("State messages per real second.", 10.0, low=0, high=100, above=True, panel=_LISTEN),
-    twin: Path | None = option("Folder of the arm's twin, which scores the motion.", None, panel=_LISTEN),
-    network: Path | None = option(
-        "Folder of `thermofleet twin identify`; the temperatures that it yields are in the states.", None, panel=_LISTEN
-    ),
+    *,
+    given: Annotated[Given, From(options.Ros2Spec)],
 ) -> None:
     """Connect a fleet to ROS 2 over Zenoh (rmw_zenoh), until Ctrl-C or SIGTERM; needs the extra `ros2`."""
     if (mode == "listen") != bool(topic):
         raise FleetError(f"Only listen takes a TOPIC, and needs one (got {mode} {topic}".rstrip() + ").")
     from scenarios.live.ros2 import run_bridge, run_jobs, run_listener
 
-    if mode == "jobs":
-        run_jobs(endpoint, fleet, domain=domain)
-    elif mode == "bridge":
-        run_bridge(endpoint, fleet, domain=domain, router=router, humble=humble, warning_c=warning_c, error_c=error_c)
-    else:
-        run_listener(
-            topic,
-            endpoint,
-            fleet,
-            arm=arm,
-            temperatures=temperatures,
-            hardware=hardware,
-            joints=joints,
-            domain=domain,
-            router=router,
-            rate_hz=rate_hz,
-            warning_c=warning_c,
-            twin=twin,
-            network=network,
-        )
+    run = {"bridge": run_bridge, "listen": partial(run_listener, topic), "jobs": run_jobs}[mode]
+    run(endpoint, fleet, options.Ros2Spec(**given))

@@ -17,10 +17,10 @@ from fleet.fields import argument, option
 from fleet.job import BOUNDS
 from fleet.robot import POSTURES, RATING, Cooling
 from scenarios.cli import options
-from scenarios.cli.from_fields import From, Given
+from scenarios.cli.options import From, Given
 from scenarios.spec.options import Shot
 from scenarios.table import Table
-from scenarios.terminal import out_console, print_json, progress_bar, say
+from scenarios.terminal import out_console, print_either, print_json, progress_bar, say
 
 SMALLEST, LARGEST = 160, 3840
 """Width and height of a film, px."""
@@ -78,10 +78,7 @@ def show_command(
         from scenarios.motion import hold as holding
 
         held = holding.hold(hold, posture, ambient, cooling=cooling, tool_kg=tool_kg, beyond_rating=beyond_rating)
-        if as_json:
-            print_json(holding.as_json(held))
-        else:
-            out_console.print(holding.as_table(held))
+        print_either(as_json, holding.as_json(held), holding.as_table(held))
     elif suite == "cells":
         _list_cells(as_json)
     elif suite is not None:
@@ -98,8 +95,7 @@ def show_command(
             return
         with progress_bar() as progress:
             parts = describe(chosen, progress)
-        for part in parts:
-            out_console.print(part)
+        out_console.print(*parts, sep="\n")
 
 
 def new_command(
@@ -131,35 +127,28 @@ def new_command(
 def _list_cells(as_json: bool) -> None:
     from scenarios.suite.instances import CELLS
 
-    if as_json:
-        print_json({cell.name: asdict(cell) for cell in CELLS})
-        return
     head = ("split", "cell", "asks", "hours", "instances")
-    lines = tuple((cell.split, cell.name, cell.asks, f"{cell.hours:g}", str(cell.instances)) for cell in CELLS)
-    out_console.print(Table(head=head, rows=lines, numbers=False))
+    rows = tuple((cell.split, cell.name, cell.asks, f"{cell.hours:g}", str(cell.instances)) for cell in CELLS)
+    print_either(as_json, {cell.name: asdict(cell) for cell in CELLS}, Table(head=head, rows=rows, numbers=False))
 
 
 def _list_split(split: str, as_json: bool) -> None:
     from scenarios.suite.splits import manifest
 
-    rows = manifest(split)
-    if as_json:
-        print_json([asdict(row) for row in rows])
-        return
-    axes = (", ".join(f"{name} {value}" for name, value in asdict(row.axes).items()) for row in rows)
-    lines = tuple((row.name, row.cell, text, str(row.count)) for row, text in zip(rows, axes, strict=True))
-    out_console.print(Table(head=("instance", "cell", "axes", "jobs"), rows=lines, numbers=False))
+    instances = manifest(split)
+    axes = [", ".join(f"{name} {value}" for name, value in asdict(each.axes).items()) for each in instances]
+    rows = tuple((each.name, each.cell, text, str(each.count)) for each, text in zip(instances, axes, strict=True))
+    table = Table(head=("instance", "cell", "axes", "jobs"), rows=rows, numbers=False)
+    print_either(as_json, [asdict(each) for each in instances], table)
 
 
 def _list_library(as_json: bool) -> None:
     from scenarios.spec.load import library, load
 
     scenarios = {name: load(path) for name, path in library().items()}
-    if as_json:
-        print_json({name: s.description for name, s in scenarios.items()})
-        return
     rows = tuple((n, str(len(s.arms)), f"{s.horizon_s / 3600:g}", s.description) for n, s in scenarios.items())
-    out_console.print(Table(head=("scenario", "arms", "hours", "description"), rows=rows, numbers=False))
+    table = Table(head=("scenario", "arms", "hours", "description"), rows=rows, numbers=False)
+    print_either(as_json, {name: s.description for name, s in scenarios.items()}, table)
 
 
 def layout_command(
@@ -177,7 +166,7 @@ def layout_command(
     Exit code 2: there are problems.
     """
     from scenarios.result_folder import check_file, new_file
-    from scenarios.show.layout import layout_report, layout_tables
+    from scenarios.show.layout import layout_parts, layout_report
     from scenarios.spec.load import load
     from scenarios.spec.parse import parse_cell
 
@@ -199,12 +188,7 @@ def layout_command(
     if wrong:
         own = f"{chosen.name}.toml: jobs["  # no jobs of the file
         report = replace(report, problems=(wrong, *(each for each in report.problems if not each.startswith(own))))
-    if as_json:
-        print_json(report)
-    else:
-        tables, sentence = layout_tables(chosen, report)
-        for part in (*tables, sentence):
-            out_console.print(part)
+    print_either(as_json, report, *layout_parts(chosen, report))
     if out is not None:
         from scenarios.show.plan import draw_plan
 
@@ -332,9 +316,8 @@ def _write_film(run: Path, out: Path, shot: Shot) -> None:
 
     stored = open_run(run)
     at_s = times(stored, shot)
-    most = (
-        min(MOST_FRAMES, MOST_GIF_PIXELS // (shot.width * shot.height)) if out.suffix.lower() == ".gif" else MOST_FRAMES
-    )
+    in_memory = MOST_GIF_PIXELS // (shot.width * shot.height)
+    most = min(MOST_FRAMES, in_memory) if out.suffix.lower() == ".gif" else MOST_FRAMES
     if len(at_s) > most:
         raise FleetError(
             f"The film would have {len(at_s)} pictures; at most {most} are possible in this size. Raise --speed (now "
@@ -398,7 +381,10 @@ def report_command(
         return
     folder = folders[0] if folders else last_folder(Path("runs"))
     if trace is not None:
-        _print_trace(folder, trace, as_json)
+        from scenarios.live.trace import thread_of, thread_table
+
+        thread = thread_of(folder, trace)
+        print_either(as_json, thread.as_json(), thread_table(thread))
         return
     if (folder / "run.json").exists():
         path, run = out or folder / "report.html", open_run(folder)
@@ -415,7 +401,7 @@ def _compare_runs(folders: Sequence[Path], out: Path | None) -> None:
     """Write the page of several runs, or their table."""
     from scenarios.result_folder import new_file
     from scenarios.run.log import open_run
-    from scenarios.show.runs_page import runs_page, runs_table
+    from scenarios.show.run_page import runs_page, runs_table
 
     path = out or folders[0].parent / "compared.html"
     options.check_table_file(path, (".html",))
@@ -434,16 +420,6 @@ def _compare_runs(folders: Sequence[Path], out: Path | None) -> None:
         else:
             draft.write_bytes(runs_table(logs).content(path.suffix.lower()))
     say(f"Written to {path}.", out_console)
-
-
-def _print_trace(folder: Path, event: str, as_json: bool) -> None:
-    from scenarios.live.trace import thread_of, thread_table
-
-    thread = thread_of(folder, event)
-    if as_json:
-        print_json(thread.as_json())
-    else:
-        out_console.print(thread_table(thread))
 
 
 def last_folder(runs: Path) -> Path:

@@ -17,7 +17,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from fleet.errors import FleetError, JournalFull, NoRouter, printable, visible
 from fleet.live.supervisor import SUPERVISED, WAITS
-from scenarios.cli.from_fields import with_fields
+from scenarios.cli.options import with_fields
 from scenarios.extras import missing_extra
 from scenarios.terminal import INTERRUPTED, Interrupted, echo, err_console, say
 

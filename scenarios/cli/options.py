@@ -1,18 +1,21 @@
-"""Options that several commands share."""
+"""Options of commands: how they are declared, those that several commands share, and what they mean."""
 
+import inspect
 import shlex
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import MISSING, Field, dataclass, fields, replace
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
 
 import typer
 
 from fleet.bus.exchange.channel import Channel
 from fleet.errors import FleetError, LogError, nearest, printable
-from fleet.fields import argument, option
+from fleet.fields import Option, argument, option, option_of, options_of
 from scenarios.spec import options as spec_options
 from scenarios.table import TABLE_FILES
 
@@ -20,6 +23,130 @@ if TYPE_CHECKING:  # slow to import
     from scenarios.prepare.randomisation import Randomisation
     from scenarios.spec.schema import Scenario
     from twin.logs.recording import Recording
+
+
+_GIVEN = ("COMMANDLINE", "ENVIRONMENT")
+"""Names of typer's sources of a value that is not a default; their class is private."""
+Given = dict[str, Any]
+"""Values of fields that the command line gives, by field; the others keep the default of the dataclass."""
+
+
+class From:
+    """Marks a parameter `Annotated[Given, From(KIND, "field", …)]`, which gets options in its place.
+
+    Args:
+        kind: A dataclass whose fields are declared with `fleet.fields.option`.
+        names: The fields; all of them if there are none.
+        defaults: Of fields whose default is another one in this command.
+    """
+
+    def __init__(self, kind: type, *names: str, **defaults: Any) -> None:
+        known = options_of(kind)
+        self.defaults = defaults
+        self.options = {name: known[name] for name in names or known}
+        self.options |= {name: replace(known[name], shown=None) for name in defaults}
+        self.fields: dict[str, Field[Any]] = {each.name: each for each in fields(kind) if each.name in self.options}
+
+    def parameters(self) -> list[inspect.Parameter]:
+        """One keyword parameter for each field."""
+        return [
+            _parameter(name, self.fields[name].type, known, self._default(name)) for name, known in self.options.items()
+        ]
+
+    def _default(self, name: str) -> Any:
+        default = self.defaults.get(name, self.fields[name].default)
+        return None if self.options[name].shown is not None or default in (MISSING, ()) else default
+
+    def take(self, values: dict[str, Any], ctx: typer.Context) -> Given:
+        """Remove the own values from those of all parameters, and return the given ones.
+
+        Raises:
+            FleetError: a text has another form.
+        """
+        own = {name: values.pop(name) for name in self.options}
+        sources = {name: getattr(ctx.get_parameter_source(name), "name", "") for name in own}
+        given = {name: value for name, value in own.items() if sources[name] in _GIVEN or name in self.defaults}
+        for name, value in given.items():
+            if parse := self.options[name].parse:
+                try:
+                    given[name] = tuple(parse(text) for text in value)
+                except ValueError as error:
+                    raise FleetError(str(error)) from error
+        return given
+
+
+def with_fields(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function of a command, whose options and arguments are declared as typer reads them."""
+    parameters, sources = list[inspect.Parameter](), dict[str, From]()
+    has_context = False
+    for each in inspect.signature(function, eval_str=True).parameters.values():
+        marks = [mark for mark in get_args(each.annotation) if isinstance(mark, From)]
+        if marks:
+            sources[each.name] = marks[0]
+            parameters += marks[0].parameters()
+        elif isinstance(each.default, Field) and (known := option_of(each.default, each.annotation)):
+            parameters.append(_parameter(each.name, each.annotation, known, each.default.default))
+        elif each.annotation is typer.Context:
+            has_context = True
+        else:
+            parameters.append(each.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+
+    @wraps(function)
+    def command(ctx: typer.Context, **values: Any) -> Any:
+        given = {name: source.take(values, ctx) for name, source in sources.items()}
+        return function(**values, **given, **({"ctx": ctx} if has_context else {}))
+
+    parameters.append(inspect.Parameter("ctx", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context))
+    command.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportAttributeAccessIssue]
+    command.__annotations__ = {each.name: each.annotation for each in parameters}
+    return command
+
+
+def _parameter(name: str, kind: Any, known: Option, default: Any) -> inspect.Parameter:
+    """A keyword parameter as typer reads it (Any: the type of a field or parameter, and a value of it)."""
+    flag = known.flag or f"--{name.replace('_', '-')}"
+    called = name.upper() if known.is_argument else flag.partition("/")[0]
+
+    def check(_: typer.CallbackParam, value: object) -> object:
+        if problem := known.problem(called, value, default):
+            raise FleetError(problem)
+        return value
+
+    shared: Any = {
+        "help": known.help,
+        "callback": check,
+        "show_default": True if known.shown is None else known.shown or False,
+        "rich_help_panel": known.panel or None,
+        "metavar": known.metavar,
+        "envvar": known.env,
+        "autocompletion": (lambda: list(known.choices)) if known.choices else None,
+    }
+    declared = typer.Argument(**shared) if known.is_argument else typer.Option(flag, **shared)
+    plain = list[str] if known.parse else _plain(kind, known)
+    annotation = Annotated[plain | None if default is None else plain, declared]
+    default = inspect.Parameter.empty if default is MISSING else default
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+def _plain(kind: Any, known: Option) -> Any:
+    """The type of a field as typer reads it, without None; names are texts, whose choices the option has."""
+    if known.choices:
+        return str
+    if get_origin(kind) in (Union, UnionType):
+        kind = next(each for each in get_args(kind) if each is not NoneType)
+    return kind
+
+
+def flags_of(value: object, *names: str) -> tuple[str, ...]:
+    """Words of a command line that give these fields of a dataclass; those that are empty or False are left out."""
+    words: list[str] = []
+    for name in names:
+        given, flag = getattr(value, name), options_of(type(value))[name].flag or f"--{name.replace('_', '-')}"
+        if given is True:
+            words.append(flag)
+        elif given not in (None, False, ""):
+            words += [flag, str(given)]
+    return tuple(words)
 
 
 def command_line(ctx: typer.Context) -> str:
@@ -68,6 +195,33 @@ OVERWRITE = option("Replace an earlier result.", False)
 # Live fleets.
 ENDPOINT = option("Endpoint of the fleet's router.", spec_options.ENDPOINT, env="THERMOFLEET_ENDPOINT")
 FLEET = option("Name of the fleet. Default: the only one at the router.", "", env="THERMOFLEET_FLEET", is_name=True)
+
+_LISTEN = "ros2 listen"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ros2Spec:
+    """How a fleet meets ROS 2."""
+
+    domain: int = option("The ROS 2 domain.", 0, low=0, high=232, env="ROS_DOMAIN_ID")
+    router: str = option("Router of ROS 2 (rmw_zenohd), as tcp/127.0.0.1:7447; default: the fleet's router.", "")
+    warning_c: float = option("Motor temperature at which a warning begins, °C.", 60.0, low=0, high=200)
+    error_c: float = option("bridge: motor temperature at which an error begins, °C.", 75.0, low=0, high=200)
+    humble: bool = option("bridge: for ROS 2 Humble, whose keys have no type hash.", False)
+    arm: str = option("Name of the arm in the fleet.", "real", is_name=True, panel=_LISTEN)
+    temperatures: str = option(
+        "Topic of the diagnostic_msgs/DiagnosticArray with its motor temperatures.", "", panel=_LISTEN
+    )
+    hardware: str = option(
+        "Text before /JOINT in the hardware_id of these diagnostics; default: none.", "", panel=_LISTEN
+    )
+    joints: str = option("Names of its joints in ROS 2, from joint 1 on.", "", panel=_LISTEN)
+    rate_hz: float = option("State messages per real second.", 10.0, low=0, high=100, above=True, panel=_LISTEN)
+    twin: Path | None = option("Folder of the arm's twin, which scores the motion.", None, panel=_LISTEN)
+    network: Path | None = option(
+        "Folder of `thermofleet twin identify`; the temperatures that it yields are in the states.", None, panel=_LISTEN
+    )
+
 
 # Twins.
 SCENARIO_OR_LOG = argument("A library name (see `thermofleet show`) or a .toml file; or use --log.", None)

@@ -5,6 +5,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,17 +15,14 @@ from fleet.bus.exchange.channel import Channel
 from fleet.errors import FleetError
 from fleet.fields import option
 from scenarios.cli import options
-from scenarios.cli.from_fields import From, Given
+from scenarios.cli.options import From, Given
 from scenarios.spec.options import RunSpec
-from scenarios.table import Table
 from scenarios.terminal import INTERRUPTED, Interrupted, out_console, print_json, progress_bar, say
 
 if TYPE_CHECKING:  # slow to import
-    from fleet.events import Event
     from scenarios.prepare.fleet import Fleet
     from scenarios.progress import Progress
     from scenarios.run.log import RunLog
-    from scenarios.run.metrics import Metrics
     from scenarios.spec.schema import Scenario
 
 DEMO_POLICY = "wsept"
@@ -60,6 +58,7 @@ def run_command(
     from scenarios.policy_loader import label, policy_of
     from scenarios.result_folder import check_free
     from scenarios.run.log import RUN
+    from scenarios.show.run_page import figure_table
     from scenarios.spec.jobs import check_some_jobs
     from scenarios.spec.load import load, own_seed
 
@@ -85,7 +84,9 @@ def run_command(
         print_json({"out": str(where), **{key: result.card[key] for key in keys}})
     else:
         say(f"{chosen.name}, seed {spec.seed}", out_console)
-        out_console.print(metrics_table({label(spec.policy): result.metrics}))
+        figures = figure_table({label(spec.policy): result.card["metrics"]}, wholes=True)
+        peaks = [(f"peak {arm}, °C", f"{peak_c:.1f}") for arm, peak_c in result.metrics.peak_c.items()]
+        out_console.print(replace(figures, rows=(*figures.rows, *peaks)))
         if result.metrics.illegal_actions:
             say(f"The policy chose {result.metrics.illegal_actions} illegal actions; each counted as a wait.")
         if result.finished:
@@ -105,7 +106,7 @@ def demo_command(
 ) -> None:
     """Run the quickstart shift under two policies, and compare them on one page."""
     from scenarios.result_folder import disk_errors
-    from scenarios.show.run_page import pair_page, pair_table
+    from scenarios.show.run_page import figure_table, runs_page
     from scenarios.spec.load import load
 
     chosen, seed = load("quickstart"), given["seed"]
@@ -119,23 +120,21 @@ def demo_command(
             if not result.finished:
                 raise Interrupted(f"Interrupted while working; recordings are in {out}.")
             results[policy] = result
-    reports = {f"{policy}/report.html": result for policy, result in results.items()}
     with disk_errors(out):
         about = [sentence.format(policy=DEMO_POLICY) for sentence in ABOUT]
         model = results[DEMO_POLICY].cell_model()
-        page = pair_page(f"{chosen.name} · seed {seed} · two policies", about, reports, model)
+        title = f"{chosen.name} · seed {seed} · two policies"
+        reports = {policy: f"{policy}/report.html" for policy in results}
+        page = runs_page(results, title=title, lead=about, reports=reports, model=model)
         (out / PAIR).write_text(page, encoding="utf-8")
     say(f"{chosen.name}, seed {seed}: {chosen.description}", out_console)
-    out_console.print(pair_table(results))
-    for report, result in sorted(reports.items(), key=lambda each: -len(each[1].faults)):
+    out_console.print(figure_table({policy: result.card["metrics"] for policy, result in results.items()}))
+    for result in sorted(results.values(), key=lambda each: -len(each.faults)):
         count = len(result.faults)
-        how = f"{count} fault{'s' * (count > 1)}, of {_named(result.faults)}" if count else "no fault"
-        say(f"{result.policy}: {how}. {out / report}", out_console)
+        of = ", ".join(dict.fromkeys(f"{fault.arm} (joint {fault.joint})" for fault in result.faults))
+        how = f"{count} fault{'s' * (count > 1)}, of {of}" if count else "no fault"
+        say(f"{result.policy}: {how}. {out / result.policy / 'report.html'}", out_console)
     say(f"Open {out / PAIR} in a browser to see both side by side.", out_console)
-
-
-def _named(faults: "list[Event]") -> str:
-    return ", ".join(dict.fromkeys(f"{fault.arm} (joint {fault.joint})" for fault in faults))
 
 
 def _run_into(
@@ -182,29 +181,3 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
         yield pressed.is_set
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def metrics_table(results: "dict[str, Metrics]") -> Table:
-    """Key figures, one column per policy."""
-    figures: list[tuple[str, Callable[[Metrics], str]]] = [
-        ("jobs finished", lambda m: f"{m.finished} of {m.jobs}"),
-        ("value", lambda m: f"{m.value:g} of {m.value_offered:g}"),
-        ("on time", lambda m: str(m.on_time)),
-        ("tardiness, min", lambda m: f"{m.tardiness_min:.1f}"),
-        ("faults", lambda m: str(m.faults)),
-        ("given up", lambda m: str(m.given_up)),
-        ("expired", lambda m: str(m.expired)),
-        ("min above warning", lambda m: f"{m.above_warning_min:.1f}"),
-        ("availability", lambda m: f"{m.availability:.1%}"),
-        ("energy, Wh", lambda m: f"{m.energy_wh:.0f}"),
-        ("insulation life used, ppb", lambda m: f"{max(m.insulation_ppb.values()):.1f}"),
-        ("hot surface, min", lambda m: f"{m.hot_surface_min:.1f}"),
-        ("tool drift, mm", lambda m: f"{max(m.tool_drift_mm.values()):.2f}"),
-    ]
-    if any(m.contacts for m in results.values()):
-        figures.append(("contacts", lambda m: "-" if m.contacts is None else str(m.contacts)))
-    figures += [
-        (f"peak {arm}, °C", lambda m, arm=arm: f"{m.peak_c[arm]:.1f}") for arm in next(iter(results.values())).peak_c
-    ]
-    rows = tuple((name, *(text(m) for m in results.values())) for name, text in figures)
-    return Table(head=("", *results), rows=rows)

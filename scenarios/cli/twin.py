@@ -15,7 +15,7 @@ from fleet.fields import MAX_SEED, argument, option
 from fleet.job import BOUNDS
 from fleet.robot import POSTURES
 from scenarios.cli import options
-from scenarios.cli.from_fields import From, Given
+from scenarios.cli.options import From, Given
 from scenarios.result_folder import check_file, check_free, check_overwrite, new_file, new_folder
 from scenarios.table import Table
 from scenarios.terminal import echo, out_console, print_json, print_wide, progress_bar, say
@@ -503,32 +503,37 @@ def report_command(
     """
     check_source(scenario, log)
     from fleet.files import cache_folder
+    from scenarios.progress import Count
     from scenarios.show import twin_report
     from scenarios.spec.load import load
 
     check_free(out, twin_report.REPORT, overwrite=overwrite)
     bar = progress_bar(kept="Twins already trained are")
     with bar as progress, new_folder(out, twin_report.REPORT, overwrite=overwrite) as folder:
-        how: Any = {"size": twin_report.SIZE, "folder": cache_folder(), "progress": progress}  # arguments
+        how: Any = {"size": twin_report.SIZE, "folder": cache_folder()}  # arguments
         if log is not None:
             title, source = f"The twin of the logs in {log.name}", f"--log {log.name}"
-            subjects = twin_report.log_subjects(options.arm_recordings(log, arm, skip_damaged), range(seeds), **how)
+            recordings = options.arm_recordings(log, arm, skip_damaged)
+            subjects = list[twin_report.Subject]()
+            for seed in range(seeds):
+                progress("training", Count(seed, seeds))
+                subjects.append(twin_report.log_subject(recordings, seed, **how))
         else:
             chosen = load(str(scenario))
             index = 0 if arm is None else chosen.index_of(arm)
             name = chosen.arms[index].name
             title, source = f"The twin of {name} in {chosen.name}", f"{scenario} --arm {name}"
-            subjects = twin_report.scenario_subjects(chosen, index, range(seeds), **how)
+            subjects = twin_report.scenario_subjects(chosen, index, range(seeds), **how, progress=progress)
         chapters = twin_report.chapters_of(subjects, twin_report.SIZE, progress)
         origin = {"command": f"thermofleet twin report {source} --seeds {seeds}", **twin_report.origin_of(subjects)}
-        card = twin_report.write(chapters, origin, folder, title)
+        failed = twin_report.write(chapters, origin, folder, title)
     if as_json:
         echo((out / twin_report.CARD).read_text(encoding="utf-8"), nl=False)
     else:
         say(f"Open {out / twin_report.PAGE} in a browser.", out_console)
-    if card["failed"]:
-        reasons = "; ".join(f"{key}: {why}" for key, why in card["failed"].items())
-        say(f"{len(card['failed'])} of {len(chapters)} chapters could not be computed ({reasons})")
+    if failed:
+        reasons = "; ".join(f"{key}: {why}" for key, why in failed.items())
+        say(f"{len(failed)} of {len(chapters)} chapters could not be computed ({reasons})")
         raise typer.Exit(1)
 
 

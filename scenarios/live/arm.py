@@ -32,9 +32,8 @@ from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
 from fleet.live.journal import CompactingJournal, Journal, own_records, quarantine
 from fleet.motion import Plan
-from scenarios.live.auctioneer import live_fleet, scenario_jobs, summary
-from scenarios.live.cell import cell_message, cell_space
-from scenarios.live.journals import folder_of, refuse_other_way
+from scenarios.live.auctioneer import folder_of, live_fleet, refuse_other_way, scenario_jobs, summary
+from scenarios.live.cell import cell_of
 from scenarios.policy_loader import arm_policy_of, scope_of
 from scenarios.progress import Progress
 from scenarios.signals import StopRequest, until_stopped
@@ -327,6 +326,7 @@ def membership_of(scenario: Scenario, name: str, policy: str, *, jobs: str, seed
     chosen.reset(np.random.default_rng(np.random.SeedSequence([seed, 1, place])))
     stream = jobs == "scenario"
     fleet = live_fleet(scenario, ends=stream)
+    cell, space = cell_of(scenario, name)
     return Membership(
         fleet=fleet,
         choose=chosen.choose,
@@ -334,8 +334,8 @@ def membership_of(scenario: Scenario, name: str, policy: str, *, jobs: str, seed
         places=frozenset(place.name for place in scenario.places),
         stream=tuple(scenario_jobs(scenario, seed)) if stream else (),
         horizon_s=fleet.horizon_s,
-        excludes=cell_space(scenario),
-        cell=cell_message(scenario, name),
+        excludes=space,
+        cell=cell,
     )
 
 

@@ -3,8 +3,9 @@
 import logging
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from graphlib import TopologicalSorter
+from pathlib import Path
 
 import numpy as np
 
@@ -20,9 +21,9 @@ from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.records import AuctionRecord, salvage
 from fleet.live.auction.rounds import Allocate, Assignment, Bidding, Timing, resolve_claims
 from fleet.live.journal import Journal, quarantine
-from scenarios.live.cell import cell_message, cell_space
-from scenarios.live.journals import folder_of, refuse_other_way
+from scenarios.live.cell import cell_of
 from scenarios.policy_loader import ON_BUS, OnBus, policy_at, scope_of, without_simulator
+from scenarios.result_folder import disk_errors
 from scenarios.signals import StopRequest, until_stopped
 from scenarios.spec.jobs import draw_jobs
 from scenarios.spec.options import LiveSpec
@@ -118,7 +119,7 @@ def run_auctioneer(scenario: Scenario, name: str, spec: LiveSpec, endpoint: str)
     fleet, folder = folder_of(spec.journal, spec.fleet, scenario)
     refuse_other_way(folder, (arm.name for arm in scenario.arms), alone=False)
     with progress_bar() as progress:
-        excludes, cell = cell_space(scenario, progress=progress), cell_message(scenario, name, progress=progress)
+        cell, excludes = cell_of(scenario, name, progress)
     aside = salvage(quarantine(folder / f"{name}.aside", name))
     with (
         until_stopped() as stop,
@@ -229,3 +230,42 @@ def summary(statuses: Sequence[JobStatus], time_s: float, left: Mapping[JobState
         arm, reason = f" (arm: {job.arm})" if job.arm else "", f", {job.reason}" if job.reason else ""
         lines.append(f"  {job.job}: {job.state}{arm}{reason}")
     return "\n".join(lines)
+
+
+def folder_of(folder: Path | None, fleet: str, scenario: Scenario) -> tuple[str, Path]:
+    """Name of the fleet, and its folder, which is created: the given ones or the default ones.
+
+    Raises:
+        FleetError: the folder cannot be created.
+    """
+    name = fleet or scenario.name
+    where = folder or Path("runs") / f"live-{name}"
+    if where.is_file():
+        raise FleetError(f"The journals need a folder, and '{where}' is a file. Give the path of a folder.")
+    with disk_errors(where):
+        where.mkdir(parents=True, exist_ok=True)
+    return name, where
+
+
+def refuse_other_way(folder: Path, arms: Iterable[str], *, alone: bool, new_epoch: bool = False) -> None:
+    """Refuse journals of a shift with the other kind of allocation, since jobs would be done twice.
+
+    Args:
+        alone: Whether the arms allocate jobs without an auctioneer.
+        new_epoch: Whether an arm may begin without its grants.
+
+    Raises:
+        FleetError: a journal is of the other kind.
+    """
+    remedy = "Use the --policy that the shift was started with, or another folder for a new shift."
+    for arm in arms:
+        grants, journal = folder / f"{arm}.grants", folder / f"{arm}.journal"
+        if alone and not (new_epoch or grants.exists()) and journal.exists() and journal.stat().st_size:
+            raise FleetError(
+                f"'{journal}' has no '{grants.name}' in its folder: the shift had an auctioneer, or the grants are "
+                f"lost, and jobs would be done twice. {remedy} If the grants are lost: --new-epoch."
+            )
+        if not alone and grants.exists() and grants.stat().st_size:
+            raise FleetError(
+                f"'{grants}' belongs to a shift without an auctioneer, so jobs could be done twice. {remedy}"
+            )

@@ -1,7 +1,6 @@
 """The cell of a scenario on the bus: its description as a message and back as a model, and the space of its plans."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any  # plain values of JSON
 
 from msgspec.structs import replace
@@ -30,14 +29,18 @@ KINDS = (
 JOB_FIELDS = ("payload_kg", "force_n", "dwell_s", "repetitions", "release_s", "due_s", "value")
 
 
-def cell_message(scenario: Scenario, auctioneer: str, *, cache: Path | None = None, progress: Progress = quiet) -> Cell:
-    """Describe the cell of a scenario; plans are cached."""
-    from scenarios.prepare.arms import plan_arms
+def cell_of(scenario: Scenario, participant: str, progress: Progress = quiet) -> tuple[Cell, CellSpace]:
+    """The cell of a scenario as a participant describes it, and the space of all plans; plans and space are cached.
 
-    robots = [arm.robot() for arm in scenario.arms]
-    planned = plan_arms(scenario, range(len(robots)), all_works(scenario), cache or cache_folder(), progress)
+    A plan for other work, which outsiders submitted, is not in the space: it excludes all plans of arms within reach.
+    """
+    from scenarios.prepare.arms import plan_arms
+    from scenarios.prepare.fleet import space_of
+
+    robots, folder = [arm.robot() for arm in scenario.arms], cache_folder()
+    planned = plan_arms(scenario, range(len(robots)), all_works(scenario), folder, progress)
     cell = Cell(
-        auctioneer=auctioneer,
+        auctioneer=participant,
         scenario=scenario.name,
         places=tuple(CellPlace(p.name, p.position_m, p.tool_deg, p.retreat_m) for p in scenario.places),
         arms=tuple(
@@ -53,7 +56,14 @@ def cell_message(scenario: Scenario, auctioneer: str, *, cache: Path | None = No
     )
     if len(encode(cell)) > MAX_BYTES:
         cell = replace(cell, arms=tuple(replace(arm, works=()) for arm in cell.arms))
-    return cell
+    table = space_of(scenario, robots, [plan for arm in planned for plan in arm.all_plans], folder, progress)
+    space = CellSpace(
+        volume={space_name(key): volume for key, volume in table.volume.items()},
+        conflicts=table.conflicts,
+        reach=arms_in_reach(robots, scenario.clearance_m),
+        arms=frozenset(robot.name for robot in robots),
+    )
+    return cell, space
 
 
 def described_model(cell: Cell, arms: Sequence[str]) -> dict[str, Any]:
@@ -79,27 +89,6 @@ def described_model(cell: Cell, arms: Sequence[str]) -> dict[str, Any]:
     for shown, arm in zip(model["arms"], arms, strict=True):
         shown["name"] = arm  # any name of the bus, not only one of a scenario
     return model
-
-
-def cell_space(scenario: Scenario, *, cache: Path | None = None, progress: Progress = quiet) -> CellSpace:
-    """Compute the space of all plans of a scenario; plans and space are cached.
-
-    A plan for other work, which outsiders submitted, is not in it: it excludes all plans of arms within reach.
-    """
-    from scenarios.prepare.arms import plan_arms
-    from scenarios.prepare.fleet import space_of
-
-    folder = cache or cache_folder()
-    robots = [arm.robot() for arm in scenario.arms]
-    planned = plan_arms(scenario, range(len(robots)), all_works(scenario), folder, progress)
-    plans = [plan for arm in planned for plan in arm.all_plans]
-    table = space_of(scenario, robots, plans, folder, progress)
-    return CellSpace(
-        volume={space_name(key): volume for key, volume in table.volume.items()},
-        conflicts=table.conflicts,
-        reach=arms_in_reach(robots, scenario.clearance_m),
-        arms=frozenset(robot.name for robot in robots),
-    )
 
 
 def _arm(robot: Robot, works: tuple[PlannedWork, ...]) -> CellArm:

@@ -10,10 +10,9 @@ from agents.policy import no_simulator
 from fleet.bus.security.tls import Tls
 from fleet.errors import FleetError, nearest
 from fleet.live.supervisor import Part, Supervisor
-from scenarios.cli.from_fields import flags_of
-from scenarios.cli.options import split_names
+from scenarios.cli.options import flags_of, split_names
 from scenarios.extras import require_extra
-from scenarios.live.journals import folder_of, refuse_other_way
+from scenarios.live.auctioneer import folder_of, refuse_other_way
 from scenarios.policy_loader import plans, scope_of
 from scenarios.signals import until_stopped
 from scenarios.spec.load import load
@@ -162,20 +161,8 @@ def run_fleet(
 def page_of(scenario: str, fleet: str, at: str, tls: Path | None) -> Part:
     """The live page of a fleet, on a port that is free now; it keeps the port when it is restarted."""
     endpoint, port = at if tls is None else Tls(tls, "operator").endpoint(at), free_port(PAGE_PORT)
-    argv = (
-        *PROGRAM,
-        "bus",
-        "gateway",
-        "--page",
-        "--scenario",
-        scenario,
-        "--endpoint",
-        endpoint,
-        "--fleet",
-        fleet,
-        "--port",
-        str(port),
-    )
+    words = ("bus", "gateway", "--page", "--scenario", scenario, "--endpoint", endpoint, "--fleet", fleet)
+    argv = (*PROGRAM, *words, "--port", str(port))
     return Part(name="page", argv=argv, rank=1, ready=f"{PAGE_READY}http://127.0.0.1:{port}/")
 
 

@@ -111,22 +111,16 @@ class LivePage:
     """The page of a gateway; without a model the cell is drawn as the auctioneer describes it."""
 
     def __init__(self, model: Mapping[str, Any] | None = None) -> None:
-        self._given = model
-        self._cell: Cell | None = None
-        self._model: Mapping[str, Any] = {}
+        self._model = model
 
     async def scene(self, ask_cell: Callable[[], Awaitable[Cell]]) -> Mapping[str, Any]:
         """The cell in three dimensions; raises BusError if no participant describes it, or with invalid numbers."""
-        if self._given is not None:
-            return self._given
-        cell = await ask_cell()
-        if cell != self._cell:
-            try:
-                self._model = await asyncio.to_thread(_model_of, cell)
-            except ValueError as error:
-                raise BusError(f"The auctioneer describes an invalid cell: {error}") from error
-            self._cell = cell
-        return self._model
+        if self._model is not None:
+            return self._model
+        try:
+            return await asyncio.to_thread(_model_of, await ask_cell())
+        except ValueError as error:
+            raise BusError(f"The auctioneer describes an invalid cell: {error}") from error
 
     async def file(self, request: Request) -> Response:
         """A file of the page."""
@@ -220,13 +214,11 @@ class AccessCheck:
     """Passes requests with a token, at a limited rate; without tokens, requests to the local names of this machine.
 
     The host name is checked because a page of another site could otherwise send requests under its own host name (DNS
-    rebinding). A `public` request needs no token.
+    rebinding). Requests for the page and its files need no token.
     """
 
-    def __init__(
-        self, app: ASGIApp, tokens: Mapping[str, Role], public: Callable[[Scope], bool] = lambda scope: False
-    ) -> None:
-        self.app, self.tokens, self.public = app, {token.encode(): role for token, role in tokens.items()}, public
+    def __init__(self, app: ASGIApp, tokens: Mapping[str, Role], page: bool) -> None:
+        self.app, self.tokens, self.page = app, {token.encode(): role for token, role in tokens.items()}, page
         self._senders: dict[bytes, tuple[float, float]] = {}
         """Remaining requests of each sender, and the loop time of that count."""
 
@@ -235,7 +227,7 @@ class AccessCheck:
         refusal = None
         if scope["type"] == "http":
             headers = dict(scope["headers"])
-            refusal = None if self.tokens and self.public(scope) else self.refusal(headers)
+            refusal = None if self.tokens and self.page and is_public(scope) else self.refusal(headers)
             if refusal is None:
                 shown = headers.get(b"authorization", b"")[7:]
                 scope["role"] = self.tokens.get(shown, "monitor" if self.tokens else "operator")
@@ -314,9 +306,6 @@ def application(
     readers: Readers,
     *,
     tokens: Mapping[str, Role] = NO_TOKENS,
-    heartbeat_s: float = HEARTBEAT_S,
-    stuck_s: float = STUCK_S,
-    body_s: float = BODY_S,
     page: LivePage | None = None,
 ) -> Starlette:
     """Make the application; with tokens every request must show one, without any only local requests are served.
@@ -345,7 +334,7 @@ def application(
         """Passes the body of a request on to the auctioneer."""
 
         async def post(request: Request) -> Response:
-            message = await read_body(request, kind, body_s)
+            message = await read_body(request, kind)
             return json_response(await ask(keys.of_jobs(bridge.fleet, topic), message, reply))
 
         return post
@@ -356,7 +345,7 @@ def application(
         return await (submit_table if content_type(request) == TABLE else submit_json)(request)
 
     async def submit_table(request: Request) -> Response:
-        content = await read_bytes(request, MAX_TABLE_BYTES, body_s)
+        content = await read_bytes(request, MAX_TABLE_BYTES)
         begin, by = (request.query_params.get(key, "") for key in ("shift_begin", "by"))
         places, reply = None, SubmissionReply("", ())
         with suppress(Refused, BusError):  # no participant knows the cell
@@ -381,7 +370,7 @@ def application(
         return json_response(await ask(keys.of_jobs(bridge.fleet, "status"), StatusRequest(names), Status))
 
     async def post_reset(request: Request) -> Response:
-        body = await read_body(request, ResetBody, body_s)
+        body = await read_body(request, ResetBody)
         if not is_name(body.arm):
             raise HttpProblem(HTTPStatus.UNPROCESSABLE_ENTITY, f"The name of an arm must have {NAME_RULE}.")
         key = keys.of_arm(bridge.fleet, body.arm, "reset")
@@ -397,7 +386,7 @@ def application(
         return json_response(await shown.scene(ask_cell))
 
     async def post_ask(request: Request) -> Response:
-        body = await read_body(request, AskBody, body_s)
+        body = await read_body(request, AskBody)
         quote_request = decode(QuoteRequest, encode(QuoteRequest("http", body.jobs, dry_run=True)))
         return json_response(await limited(lambda: bridge.quotes(quote_request)))
 
@@ -405,8 +394,7 @@ def application(
         if readers.closed or len(readers.connected) >= MAX_READERS:
             detail = f"{len(readers.connected)} readers are connected; try again later."
             raise HttpProblem(HTTPStatus.SERVICE_UNAVAILABLE, detail)
-        last_event = request.headers.get("last-event-id", "")
-        return EventStream(bridge.feed, readers, boot, last_event, heartbeat_s, stuck_s)
+        return EventStream(bridge.feed, readers, boot, request.headers.get("last-event-id", ""))
 
     async def contents(request: Request) -> Response:
         if page is not None and wants_page(request.scope):
@@ -431,25 +419,23 @@ def application(
     if page is not None:
         routes += [Route(f"/page/{name}", page.file, methods=["GET"]) for name in (*FILES, "three.js")]
     handlers = dict.fromkeys((HttpProblem, BusError, Refused, ScenarioError, HTTPException, Exception), error_response)
-    access = Middleware(AccessCheck, tokens=tokens, **({"public": is_public} if page is not None else {}))
+    access = Middleware(AccessCheck, tokens=tokens, page=page is not None)
     return Starlette(routes=routes, exception_handlers=handlers, middleware=[access])
 
 
 class EventStream(StreamingResponse):
     """Server-sent events until the reader disconnects or falls behind, or the gateway stops."""
 
-    def __init__(
-        self, feed: EventFeed, readers: Readers, boot: str, last_event: str, heartbeat_s: float, stuck_s: float
-    ) -> None:
+    def __init__(self, feed: EventFeed, readers: Readers, boot: str, last_event: str) -> None:
         super().__init__(self._text(), media_type="text/event-stream", headers={"Cache-Control": "no-store"})
         self._feed, self._readers, self._boot, self._last_event = feed, readers, boot, last_event
-        self._heartbeat_s, self._stuck_s, self._woken = heartbeat_s, stuck_s, asyncio.Event()
+        self._woken = asyncio.Event()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Write the stream."""
 
         async def send_in_time(message: Message) -> None:
-            await asyncio.wait_for(send(message), self._stuck_s)
+            await asyncio.wait_for(send(message), STUCK_S)
 
         self._readers.connected.add(self._woken)
         try:
@@ -468,7 +454,7 @@ class EventStream(StreamingResponse):
         seen = entries[-1].number if entries else seen
         while not self._readers.closed:
             try:
-                await asyncio.wait_for(self._woken.wait(), self._heartbeat_s)
+                await asyncio.wait_for(self._woken.wait(), HEARTBEAT_S)
             except TimeoutError:
                 yield ": heartbeat\n\n"
                 continue
@@ -498,7 +484,7 @@ def _checked(needed: Role, handle: Endpoint) -> Endpoint:
     return check
 
 
-async def read_body(request: Request, kind: type[Body], body_s: float) -> Body:
+async def read_body(request: Request, kind: type[Body]) -> Body:
     """Read the message that is the body of a request.
 
     Raises:
@@ -508,7 +494,7 @@ async def read_body(request: Request, kind: type[Body], body_s: float) -> Body:
     if (given := content_type(request)) != "application/json":
         detail = f"The body must be application/json, or for /v4/jobs also {TABLE} (got '{given}')."
         raise HttpProblem(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, detail)
-    return decode(kind, await read_bytes(request, MAX_BYTES, body_s))
+    return decode(kind, await read_bytes(request, MAX_BYTES))
 
 
 def content_type(request: Request) -> str:
@@ -516,18 +502,18 @@ def content_type(request: Request) -> str:
     return request.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
-async def read_bytes(request: Request, most: int, body_s: float) -> bytes:
+async def read_bytes(request: Request, most: int) -> bytes:
     """Read a body of at most so many bytes; raises an HttpProblem if it is too large or too slow."""
     content = bytearray()
     try:
-        async with asyncio.timeout(body_s):
+        async with asyncio.timeout(BODY_S):
             async for part in request.stream():
                 content += part
                 if len(content) > most:
                     detail = f"A body has at most {most} bytes; send several requests."
                     raise HttpProblem(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)
     except TimeoutError as error:
-        raise HttpProblem(HTTPStatus.REQUEST_TIMEOUT, f"The body did not arrive within {body_s:g} s.") from error
+        raise HttpProblem(HTTPStatus.REQUEST_TIMEOUT, f"The body did not arrive within {BODY_S:g} s.") from error
     except ClientDisconnect as error:
         raise HttpProblem(HTTPStatus.BAD_REQUEST, "The body is incomplete.") from error
     return bytes(content)
@@ -571,7 +557,7 @@ def run_gateway(
         roles[check_token(token)] = "operator"
     check(host, endpoint, bool(roles))
     name = the_fleet(fleet, endpoint)
-    with listen(host, port, STUCK_S) as bound:
+    with listen(host, port) as bound:
         with until_stopped() as stop:
             link = BusClient(endpoint, name, stopped=stop.is_set).open()
         with link:
@@ -605,8 +591,8 @@ def check(host: str, endpoint: str, has_tokens: bool) -> None:
     _LOG.warning("Listening on %s: HTTP is not encrypted and shows the token; put TLS in front.", host)
 
 
-def listen(host: str, port: int, stuck_s: float) -> socket.socket:
-    """Listening socket; the system closes connections whose reader receives nothing for `stuck_s`.
+def listen(host: str, port: int) -> socket.socket:
+    """Listening socket; the system closes connections whose reader receives nothing for `STUCK_S`.
 
     Raises:
         FleetError: the address is not of this machine, or the port is in use.
@@ -614,7 +600,7 @@ def listen(host: str, port: int, stuck_s: float) -> socket.socket:
     bound = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
     bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     if hasattr(socket, "TCP_USER_TIMEOUT"):
-        bound.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * stuck_s))
+        bound.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * STUCK_S))
     try:
         bound.bind((host, port))
         bound.listen()

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
-import msgspec
 import pyarrow.parquet as pq
 from msgspec import structs
 
@@ -46,6 +45,7 @@ from scenarios.live.recording import (
     to_row,
     to_table,
 )
+from scenarios.result_folder import json_text
 
 _LOG = logging.getLogger(__name__)
 
@@ -192,7 +192,7 @@ class Recorder:
             cell=self.cell,
         )
         with self._draft(self.folder / CARD) as draft:
-            draft.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=1) + b"\n")
+            draft.write_text(json_text(card), encoding="utf-8")
         self.parts, self._written = card.parts, card.rows
         self._rows.clear()
 

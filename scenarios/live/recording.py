@@ -26,8 +26,9 @@ from fleet.bus.protocol.cell import Cell
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import ControlRequest, Operation
 from fleet.errors import FleetError
+from fleet.events import Event
 from fleet.robot import JOINTS
-from scenarios.run.log import check_format
+from scenarios.run.log import OF_EVENTS, open_run, record_table
 
 Message = State | ArmEvent | Result | Operation
 Kind = Literal["telemetry", "events", "results", "operations", "gaps"]
@@ -262,26 +263,15 @@ def open_messages(folder: Path) -> RecordedMessages:
     """Read the folder of a run or of a recording, which may still grow.
 
     Raises:
-        FleetError: it is neither.
+        FleetError: it is neither, or a damaged run.
     """
     if (folder / CARD).exists():
         return RecordedMessages(read_card(folder).fleet, *(read_parts(folder, kind) for kind in SOURCES))
-    try:
-        run = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-        check_format(run, folder)
-        return RecordedMessages(
-            fleet=run["scenario"]["name"],
-            telemetry=pq.read_table(folder / "telemetry.parquet"),
-            events=pq.read_table(folder / "events.parquet"),
-            results=pa.table({}),
-            operations=pa.table({}),
-            warning_c=run["scenario"]["limits"]["warning_c"],
-        )
-    except (OSError, ValueError, KeyError, TypeError, pa.ArrowInvalid) as error:
-        raise FleetError(
-            f"'{folder}' is neither the folder of a run (run.json, telemetry.parquet, events.parquet) nor a recording "
-            f"of the bus ({CARD})."
-        ) from error
+    if not (folder / "run.json").exists():
+        raise FleetError(f"'{folder}' is neither the folder of a run (run.json) nor a recording of the bus ({CARD}).")
+    run, none = open_run(folder), pa.table({})
+    events = record_table(Event, run.events, **OF_EVENTS)
+    return RecordedMessages(run.scenario.name, run.telemetry, events, none, none, run.limits.warning_c)
 
 
 def states(table: pa.Table, *, warning_c: float = 60.0) -> Iterator[State]:

@@ -28,9 +28,9 @@ from fleet.heat.effects import arrhenius_rate, life_used, most_drift_m, segment_
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
 from scenarios.live.cell import described_model
-from scenarios.live.recording import SENSORS, SOURCES, Kind, lost_rows, read_card, read_parts
-from scenarios.run.records import Offer, ShiftLog
-from scenarios.run.schedule import SAME_MOMENT_DIGITS
+from scenarios.live.recording import SOURCES, Kind, lost_rows, read_card, read_parts
+from scenarios.run.log import UNITS, joint_values
+from scenarios.run.records import SAME_MOMENT_DIGITS, Offer, ShiftLog
 from scenarios.show.run_page import report_html
 from scenarios.show.words import clock
 from scenarios.spec.schema import Scenario
@@ -105,7 +105,13 @@ def _cell(
 ) -> tuple[ThermalLimits, dict[str, Any] | None]:
     """Limits of the motors, and the cell in three dimensions."""
     if scenario is not None:
-        return scenario.limits, _model(scenario, arms)
+        robots = {arm.name: arm.robot() for arm in scenario.arms}
+        if missing := [arm for arm in arms if arm not in robots]:
+            raise FleetError(
+                f"The recording has the arm '{missing[0]}', and scenario '{scenario.name}' has only "
+                f"{', '.join(robots)}; give the scenario that the fleet was started with."
+            )
+        return scenario.limits, cell_model([robots[arm] for arm in arms], scenario.places, scenario.fixtures)
     limits, model = ThermalLimits(), None
     if described is not None:
         with suppress(ValueError):  # of numbers that no cell has, or of arms that joined later
@@ -113,16 +119,6 @@ def _cell(
             limits = ThermalLimits(warning_c=described.warning_c, error_c=described.error_c, restart_c=restart_c)
             model = described_model(described, arms)
     return limits, model
-
-
-def _model(scenario: Scenario, arms: Sequence[str]) -> dict[str, Any]:
-    robots = {arm.name: arm.robot() for arm in scenario.arms}
-    if missing := [arm for arm in arms if arm not in robots]:
-        raise FleetError(
-            f"The recording has the arm '{missing[0]}', and scenario '{scenario.name}' has only {', '.join(robots)}; "
-            "give the scenario that the fleet was started with."
-        )
-    return cell_model([robots[arm] for arm in arms], scenario.places, scenario.fixtures)
 
 
 def order_events(events: Iterable[Event], returns: Iterable[Event]) -> list[Event]:
@@ -249,11 +245,7 @@ def telemetry_of(table: pa.Table, arms: Sequence[str]) -> Telemetry:
     step_s = max(float(np.median(steps)), float(all_s[-1] - all_s[0]) / MOST_SAMPLES, 1e-3)
     time_s = np.arange(all_s[0], all_s[-1] + step_s, step_s)
     modes = np.array([MODES.index(mode) for mode in table["mode"].to_pylist()])
-    readings = {
-        name: np.stack([table[f"{name}_{j + 1}"].to_numpy(zero_copy_only=False) for j in range(JOINTS)], axis=-1)
-        for name in SENSORS
-        if name not in ("housing_c", "expected_c")
-    }
+    readings = {name: joint_values(table, name) for name in UNITS}
     shape = (len(time_s), len(arms), JOINTS)
     out = {name: np.full(shape, np.nan, np.float32) for name in readings}
     mode = np.zeros(shape[:2], int)
@@ -326,10 +318,7 @@ def heat_use(table: pa.Table, arms: Sequence[str]) -> dict[str, dict[str, float]
     drift: dict[str, float] = {}
     for arm in arms:
         rows = table.filter(pa.array(names == arm))
-        winding_c, housing_c = (
-            np.stack([rows[f"{name}_{j + 1}"].to_numpy(zero_copy_only=False) for j in range(JOINTS)], axis=-1)
-            for name in ("temp_c", "housing_c")
-        )
+        winding_c, housing_c = (joint_values(rows, name) for name in ("temp_c", "housing_c"))
         measured, estimated = (np.isfinite(values).all(axis=1) for values in (winding_c, housing_c))
         if measured.sum() > 1:
             time_s, rate = rows["time_s"].to_numpy()[measured], arrhenius_rate(winding_c[measured])

@@ -45,7 +45,7 @@ from scenarios.cli.options import the_fleet
 from scenarios.signals import until_stopped
 from scenarios.spec.job_table import SUFFIXES, read_job_table, shift_begin, with_cell
 from scenarios.table import Column, Table
-from scenarios.terminal import echo, out_console, print_json, say
+from scenarios.terminal import echo, print_either, say
 
 REPLY_S, ATTEMPTS = 5.0, 3
 """Real seconds to wait for a reply, and number of attempts: a repeated request is carried out once."""
@@ -146,10 +146,7 @@ def quote_jobs(jobs: Sequence[JobSpec], endpoint: str, fleet: str, *, timeout_s:
     quotes = {quote.arm: quote for quote in sorted(answers.messages.values(), key=lambda quote: quote.arm)}
     if not quotes and not answers.refused:
         raise BusError(f"No arm of fleet '{name}' replied. Is `thermofleet arm run` running?")
-    if as_json:
-        print_json(list(quotes.values()))
-    else:
-        out_console.print(quote_table(jobs, quotes))
+    print_either(as_json, list(quotes.values()), quote_table(jobs, quotes))
     for reason in answers.refused.values():
         say(f"Refused: {reason}" if reason else f"An arm did not reply within {timeout_s:g} s.")
     feasible = {estimate.job for quote in quotes.values() for estimate in quote.estimates if estimate.feasible}

@@ -3,13 +3,12 @@
 import os
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fleet.bus.client import BusClient
 from fleet.errors import FleetError
 from fleet.robot import JOINTS, ThermalLimits
-from scenarios.cli.options import split_names, the_fleet
+from scenarios.cli.options import Ros2Spec, split_names, the_fleet
 from scenarios.extras import require_extra
 from scenarios.live.arm import monitor_of
 from scenarios.signals import StopRequest, until_stopped
@@ -23,53 +22,36 @@ TURN_S = 0.25
 DEFAULTS = ThermalLimits()
 
 
-def run_bridge(
-    endpoint: str, fleet: str, *, domain: int, router: str, humble: bool, warning_c: float, error_c: float
-) -> None:
+def run_bridge(endpoint: str, fleet: str, spec: Ros2Spec) -> None:
     """Publish every arm of a fleet as JointState and DiagnosticArray, until Ctrl-C or SIGTERM."""
-    where = ros2_router(router, endpoint)
+    where = ros2_router(spec.router, endpoint)
     from fleet.ros2.bridge import Bridge
 
-    limits = limits_of(warning_c, error_c)
+    limits = limits_of(spec.warning_c, spec.error_c)
     with (
         until_stopped() as stop,
-        node_at(where, "thermofleet", domain, stop.is_set) as node,
+        node_at(where, "thermofleet", spec.domain, stop.is_set) as node,
         BusClient(endpoint, the_fleet(fleet, endpoint), stopped=stop.is_set) as link,
     ):
-        bridge = Bridge(link, node, limits=limits, humble=humble)
+        bridge = Bridge(link, node, limits=limits, humble=spec.humble)
         echo(f"ready ros2 bridge {where} {os.getpid()}")
         _serve(bridge.serve, stop, "The bridge was interrupted.")
 
 
-def run_listener(
-    topic: str,
-    endpoint: str,
-    fleet: str,
-    *,
-    arm: str,
-    temperatures: str,
-    hardware: str,
-    joints: str,
-    domain: int,
-    router: str,
-    rate_hz: float,
-    warning_c: float,
-    twin: Path | None,
-    network: Path | None,
-) -> None:
+def run_listener(topic: str, endpoint: str, fleet: str, spec: Ros2Spec) -> None:
     """Show a real arm with a ROS 2 driver as an arm of the fleet that takes no jobs, until Ctrl-C or SIGTERM.
 
     Raises:
         FleetError: the topic of its temperatures is missing, or joints or limits are not allowed.
     """
-    if not temperatures:
+    if not spec.temperatures:
         raise FleetError(
             "A JointState has no motor temperatures, and a fleet needs them: name the topic of a DiagnosticArray that "
             "has them with --temperatures. docs/ros2.md describes its content."
         )
-    names, where = names_of(joints), ros2_router(router, endpoint)
-    monitors = monitor_of(twin, network)
-    monitor = monitors and monitors(1.0 / rate_hz)
+    names, where = names_of(spec.joints), ros2_router(spec.router, endpoint)
+    monitors = monitor_of(spec.twin, spec.network)
+    monitor = monitors and monitors(1.0 / spec.rate_hz)
     if monitor and len(names) != JOINTS:
         raise FleetError(f"--twin and --network are for arms of {JOINTS} joints (got {len(names)} in --joints).")
     from fleet.live.clock import FleetClock
@@ -77,19 +59,19 @@ def run_listener(
 
     with (
         until_stopped() as stop,
-        node_at(where, f"thermofleet_{arm}", domain, stop.is_set) as node,
+        node_at(where, f"thermofleet_{spec.arm}", spec.domain, stop.is_set) as node,
         BusClient(endpoint, the_fleet(fleet, endpoint), stopped=stop.is_set) as link,
     ):
         clock = FleetClock(1.0, time.monotonic())
-        limits = limits_of(warning_c, max(warning_c + 1.0, DEFAULTS.error_c))
-        readings, topics = ArmReadings(names, hardware), (topic, temperatures)
-        how = {"limits": limits, "rate_hz": rate_hz, "monitor": monitor}
-        follower = Follower(link, node, arm, readings, topics, clock, **how)
-        echo(f"ready {arm} {topic} {os.getpid()}")
+        limits = limits_of(spec.warning_c, max(spec.warning_c + 1.0, DEFAULTS.error_c))
+        readings, topics = ArmReadings(names, spec.hardware), (topic, spec.temperatures)
+        how = {"limits": limits, "rate_hz": spec.rate_hz, "monitor": monitor}
+        follower = Follower(link, node, spec.arm, readings, topics, clock, **how)
+        echo(f"ready {spec.arm} {topic} {os.getpid()}")
         _serve(follower.serve, stop, f"Stopped listening to {topic}.")
 
 
-def run_jobs(endpoint: str, fleet: str, *, domain: int) -> None:
+def run_jobs(endpoint: str, fleet: str, spec: Ros2Spec) -> None:
     """Serve the action thermofleet_msgs/action/DoJob, until Ctrl-C or SIGTERM.
 
     Raises:
@@ -105,7 +87,7 @@ def run_jobs(endpoint: str, fleet: str, *, domain: int) -> None:
     with (
         until_stopped() as stop,
         BusClient(endpoint, the_fleet(fleet, endpoint), stopped=stop.is_set) as link,
-        JobAction(link, domain=domain) as jobs,
+        JobAction(link, domain=spec.domain) as jobs,
     ):
         echo(f"ready {jobs.name} {os.getpid()}")
         _serve(jobs.serve, stop, "The action server was stopped; submitted jobs go on.")
@@ -128,12 +110,10 @@ def ros2_router(router: str, endpoint: str) -> str:
 
 
 def node_at(router: str, name: str, domain: int, stopped: Callable[[], bool]) -> "Node":
-    """A ROS 2 node, not yet open, which waits for a router; after a check of the domain and of the installed extra."""
+    """A ROS 2 node, not yet open, which waits for a router; raises MissingExtra if its libraries are missing."""
     require_extra("ros2")
-    from fleet.ros2.node import DOMAINS, Node
+    from fleet.ros2.node import Node
 
-    if domain not in DOMAINS:
-        raise FleetError(f"--domain must be 0 to {DOMAINS[-1]} (got {domain}).")
     return Node(router, name, domain=domain, stopped=stopped)
 
 

@@ -14,7 +14,7 @@ from scenarios.live.recording import CARD, read_parts
 from scenarios.live.recording_report import open_recording
 from scenarios.run.log import open_run
 from scenarios.run.records import Offer, ShiftLog
-from scenarios.show.words import CANNOT, clock, value_text
+from scenarios.show.words import clock, offer_text, value_text
 from scenarios.table import Table
 
 CONFIGURATION = ("scenario_hash", "policy", "seed", "plant", "bus", "difficulty", "risk", "environment", "channel")
@@ -76,10 +76,13 @@ def thread_of(folder: Path, asked: str) -> Thread:
         raise FleetError(f"'{folder}' is neither a folder of `thermofleet run` nor of `thermofleet bus record`.")
     rows = rows_of(events, asked)
     event = events[rows[0]]
-    job = event.job or _job_at(log, event)
+    work = log.plan.at(event.arm, event.time_s)
+    job = event.job or (work.job if work else "")
     history = tuple(e for e in events if job and e.job == job)
-    award = _award_of(history, event)
+    awards = [e for e in history if e.kind == "award" and e.time_s <= event.time_s + 1e-6 and event.arm in ("", e.arm)]
+    award = event if event.kind == "award" else awards[-1] if awards else None
     arm = event.arm or (award.arm if award else "")
+    stated = award.reason.partition(", twin ")[2] if award else ""  # by a live arm
     twins = log.card.get("twins", {})
     scenario = {"scenario": log.card["scenario"]["name"], "status": log.card["status"]}
     return Thread(
@@ -89,25 +92,12 @@ def thread_of(folder: Path, asked: str) -> Thread:
         event=replace(event, job=job),
         job=jobs.get(job, {}),
         award=award,
-        offers=() if award is None else _offers_at(log.offers, award),
+        offers=() if award is None else log.offers_behind(award.job, award.arm, award.time_s),
         history=history,
-        twin={"arm": arm} | dict(twins.get(arm) or {"version": _live_twin(award)}) if arm else {},
+        twin={"arm": arm} | dict(twins.get(arm) or {"version": stated or NOT_RECORDED}) if arm else {},
         configuration=scenario | {name: log.card.get(name, NOT_RECORDED) for name in CONFIGURATION},
         code={"hash": log.card.get("code_hash", NOT_RECORDED)} | log.card.get("versions", {}),
     )
-
-
-def _job_at(log: ShiftLog, event: Event) -> str:
-    """Job of the arm of an event at its time; "" for none."""
-    own = (each for each in log.plan.assignments if each.arm == event.arm)
-    return next((each.job for each in own if each.start_s <= event.time_s <= each.end_s), "")
-
-
-def _offers_at(offers: Sequence[Offer], award: Event) -> tuple[Offer, ...]:
-    """Offers behind an award; in a recording their times are those of another clock, so the nearest ones."""
-    times_s = [o.time_s for o in offers if o.awarded and (o.job, o.arm) == (award.job, award.arm)]
-    time_s = min(times_s, key=lambda each: abs(each - award.time_s), default=None)
-    return tuple(o for o in offers if (o.job, o.time_s) == (award.job, time_s))
 
 
 def _recorded_jobs(folder: Path) -> dict[str, dict[str, Any]]:
@@ -155,19 +145,6 @@ def rows_of(events: Sequence[Event], asked: str) -> list[int]:
     raise FleetError(f"No event '{kind}' of '{name}'{nearest(name, of_kind)}")
 
 
-def _award_of(history: Sequence[Event], event: Event) -> Event | None:
-    """The last award of a job before an event, to its arm if it has one; that of the event itself if it is one."""
-    awards = [e for e in history if e.kind == "award" and e.time_s <= event.time_s + 1e-6]
-    own = [e for e in awards if event.arm in ("", e.arm)]
-    return event if event.kind == "award" else own[-1] if own else None
-
-
-def _live_twin(award: Event | None) -> str:
-    """Version of the twin that a live arm stated in its award."""
-    _, stated, version = award.reason.partition(", twin ") if award else ("", "", "")
-    return version if stated else NOT_RECORDED
-
-
 def _plain(event: Event) -> dict[str, Any]:
     """An event as JSON values, without the env."""
     fields = asdict(event)
@@ -184,17 +161,20 @@ def thread_table(thread: Thread) -> Table:
         if text := ", ".join(str(part) for part in parts if part not in ("", None)):
             rows.append((name, text))
 
-    row("event", f"row {thread.row} of {thread.folder}", _alike(thread))
+    others = [str(each) for each in thread.alike if each != thread.row]
+    alike = f"the first of {len(thread.alike)}, others in rows {', '.join(others[:5])}" if others else ""
+    row("event", f"row {thread.row} of {thread.folder}", alike, "…" if len(others) > 5 else "")
     row("", *_words(event), MEANINGS[event.kind].text)
     if thread.job:
         row("job", *_pairs(thread.job))
     if thread.award is not None:
         award = thread.award
-        row("award", f"{clock(award.time_s)} to {award.arm}", *_number("d", award.value), award.reason)
+        d = f"d {award.value:.2f}" if award.value == award.value else ""
+        row("award", f"{clock(award.time_s)} to {award.arm}", d, award.reason)
         row("plan", *_plan(thread.offers, award))
     shown = sorted(thread.offers, key=lambda o: (not o.awarded, not o.free, o.arm))
     for i, offer in enumerate(shown[:MOST_OFFERS]):
-        row("" if i else "offers", *_offer(offer))
+        row("" if i else "offers", f"{offer.arm}{' (awarded)' * offer.awarded}", offer_text(offer))
     if len(shown) > MOST_OFFERS:
         row("", f"and {len(shown) - MOST_OFFERS} more; offers.parquet has all of them")
     if thread.award is not None and not shown:
@@ -207,24 +187,12 @@ def thread_table(thread: Thread) -> Table:
     if isinstance(channel := thread.configuration.get("channel"), Mapping):
         row("channel", *_pairs(channel))
     row("code", *_pairs(thread.code))
-    for i, one in enumerate(_around(thread)):
+    nearest_row = bisect([one.time_s for one in thread.history], event.time_s)
+    first = max(0, min(nearest_row - MOST_HISTORY // 2, len(thread.history) - MOST_HISTORY))
+    for i, one in enumerate(thread.history[first : first + MOST_HISTORY]):
         row("" if i else "history", *_words(one))
     caption = f"{event.kind.replace('_', ' ')} at {clock(event.time_s)}"
     return Table(caption=caption, head=("", ""), rows=tuple(rows), numbers=False)
-
-
-def _around(thread: Thread) -> tuple[Event, ...]:
-    """Events of the job, the shown one among them."""
-    times_s = [event.time_s for event in thread.history]
-    begin = bisect(times_s, thread.event.time_s) - MOST_HISTORY // 2
-    begin = max(0, min(begin, len(times_s) - MOST_HISTORY))
-    return thread.history[begin : begin + MOST_HISTORY]
-
-
-def _alike(thread: Thread) -> str:
-    others = [row for row in thread.alike if row != thread.row]
-    more = ", …" if len(others) > 5 else ""
-    return f"the first of {len(thread.alike)}, others in rows {', '.join(map(str, others[:5]))}{more}" if others else ""
 
 
 def _words(event: Event) -> list[str]:
@@ -241,10 +209,6 @@ def _words(event: Event) -> list[str]:
     ]
 
 
-def _number(name: str, value: float) -> list[str]:
-    return [f"{name} {value:.2f}"] if value == value else []
-
-
 def _plan(offers: tuple[Offer, ...], award: Event) -> list[str]:
     chosen = next((offer for offer in offers if offer.awarded), None)
     duration = f"{chosen.duration_s:.0f} s" if chosen is not None and chosen.duration_s is not None else ""
@@ -253,16 +217,6 @@ def _plan(offers: tuple[Offer, ...], award: Event) -> list[str]:
     if number is None:
         return [NOT_RECORDED, duration]
     return [f"plan {number}, the {'coolest' if number else 'fastest'} that was offered", duration]
-
-
-def _offer(offer: Offer) -> list[str]:
-    if not offer.feasible:
-        return [offer.arm, CANNOT]
-    known = {"d": (offer.difficulty, ".2f"), "P": (offer.p_saturation, ".2f"), "peak °C": (offer.peak_c, ".1f")}
-    parts = [f"{name} {value:{form}}" for name, (value, form) in known.items() if value is not None]
-    duration = [f"{offer.duration_s:.0f} s"] if offer.duration_s is not None else []
-    reason = "" if offer.free else f"not free ({offer.state})"
-    return [offer.arm + (" (awarded)" if offer.awarded else ""), *parts, *duration, reason]
 
 
 def _pairs(values: Mapping[str, Any]) -> list[str]:

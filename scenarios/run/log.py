@@ -100,7 +100,7 @@ class RunLog(ShiftLog):
         with disk_errors(folder):
             card = json.dumps(self.card, indent=1, allow_nan=False) + "\n"
             (folder / "run.json").write_text(card, encoding="utf-8")
-            pq.write_table(event_table(self.events), folder / "events.parquet")
+            pq.write_table(record_table(Event, self.events, **OF_EVENTS), folder / "events.parquet")
             pq.write_table(record_table(JobRecord, self.jobs), folder / "jobs.parquet")
             pq.write_table(record_table(Offer, self.offers), folder / "offers.parquet")
             if not len(self.readings.time_s):
@@ -156,7 +156,11 @@ def open_run(folder: str | Path) -> RunLog:
     folder = Path(folder)
     try:
         card = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-        check_format(card, folder)
+        known, found = f"{RUN_FORMAT} in {VERSION}", f"{card['format']} in {card.get('environment', 'allocation_v0')}"
+        if found != known:
+            raise FleetError(
+                f"'{folder}' is a run of format {found}; this version reads {known}. Run the scenario again."
+            )
         scenario = msgspec.convert(card["scenario"], Scenario)
         tables = {name: pq.read_table(folder / f"{name}.parquet") for name in ("telemetry", "events", "jobs", "offers")}
         stored = RunLog(
@@ -165,7 +169,7 @@ def open_run(folder: str | Path) -> RunLog:
             arms=tuple(arm.name for arm in scenario.arms),
             limits=scenario.limits,
             readings=_readings(tables["telemetry"], len(scenario.arms)),
-            events=tuple(Event(**_without_nulls(row)) for row in tables["events"].to_pylist()),
+            events=tuple(Event(**row) for row in tables["events"].to_pylist()),
             jobs=tuple(JobRecord(**row) for row in tables["jobs"].to_pylist()),
             offers=tuple(Offer(**row) for row in tables["offers"].to_pylist()),
         )
@@ -181,7 +185,7 @@ def open_run(folder: str | Path) -> RunLog:
 
 def _readings(table: pa.Table, arms: int) -> Telemetry:
     samples = table.num_rows // arms
-    readings = {name: np.stack([table[f"{name}_{j + 1}"].to_numpy() for j in range(JOINTS)], axis=-1) for name in UNITS}
+    readings = {name: joint_values(table, name) for name in UNITS}
     modes = table["mode"].combine_chunks()
     numbers = np.array([MODES.index(mode) for mode in modes.dictionary.to_pylist()])[modes.indices.to_numpy()]
     return Telemetry(
@@ -191,39 +195,22 @@ def _readings(table: pa.Table, arms: int) -> Telemetry:
     )
 
 
-def _without_nulls(row: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: float("nan") if value is None else value for name, value in row.items()}
+def joint_values(table: pa.Table, name: str) -> np.ndarray:
+    """The columns of a reading, [row, joint]; NaN for what is missing."""
+    return np.stack([table[f"{name}_{j + 1}"].to_numpy(zero_copy_only=False) for j in range(JOINTS)], axis=-1)
 
 
 def _write_telemetry(telemetry: Telemetry, arms: list[str], path: Path) -> None:
     """Some rows at a time, as a table of all takes as much memory as the readings."""
+
+    def part(first: int) -> pa.Table:
+        rows = slice(first, first + samples)
+        return telemetry_table(Telemetry(**{name: values[rows] for name, values in vars(telemetry).items()}), arms)
+
     samples = max(1, ROWS_AT_ONCE // len(arms))
-    first = telemetry_table(_part(telemetry, slice(0, samples)), arms)
-    with pq.ParquetWriter(path, first.schema) as writer:
-        writer.write_table(first)
-        for i in range(samples, len(telemetry.time_s), samples):
-            writer.write_table(telemetry_table(_part(telemetry, slice(i, i + samples)), arms))
-
-
-def _part(telemetry: Telemetry, rows: slice) -> Telemetry:
-    return Telemetry(**{name: values[rows] for name, values in vars(telemetry).items()})
-
-
-def check_format(run: Mapping[str, Any], folder: Path) -> None:
-    """Check that this version can read a run.
-
-    Args:
-        run: The content of its run.json.
-
-    Raises:
-        FleetError: it is of another format or environment.
-    """
-    version, environment = run["format"], run.get("environment", "allocation_v0")
-    if (version, environment) != (RUN_FORMAT, VERSION):
-        raise FleetError(
-            f"'{folder}' is a run of format {version} in {environment}; this "
-            f"version reads {RUN_FORMAT}, {VERSION}. Run the scenario again."
-        )
+    with pq.ParquetWriter(path, part(0).schema) as writer:
+        for first in range(0, len(telemetry.time_s), samples):
+            writer.write_table(part(first))
 
 
 UNITS = {"q": "rad", "qd": "rad/s", "tau": "N·m", "current_a": "A", "temp_c": "°C"}
@@ -251,33 +238,20 @@ def telemetry_table(telemetry: Telemetry, arms: list[str]) -> pa.Table:
     return table.cast(pa.schema(described))
 
 
-def event_table(events: tuple[Event, ...]) -> pa.Table:
-    """One row per event: the fields of `Event` without the env."""
-    number, text = pa.float64(), pa.string()
-    types = {
-        "time_s": number,
-        "kind": text,
-        "arm": text,
-        "job": text,
-        "joint": pa.int8(),
-        "value": number,
-        "reason": text,
-    }
-    return pa.table({name: pa.array([getattr(e, name) for e in events], kind) for name, kind in types.items()})
+OF_EVENTS = {"kind": pa.string(), "joint": pa.int8(), "env": None}
+"""Columns of events that differ from the fields of `Event`."""
 
 
-def record_table(kind: type, records: Sequence[object]) -> pa.Table:
-    """One row per record: the fields of a dataclass of text, numbers and booleans."""
-    types = {
-        "str": pa.string(),
-        "bool": pa.bool_(),
-        "int": pa.int64(),
-        "int | None": pa.int64(),
-        "float": pa.float64(),
-        "float | None": pa.float64(),
-    }
-    names = {field.name: types[getattr(field.type, "__name__", str(field.type))] for field in fields(kind)}
-    return pa.table({name: pa.array([getattr(r, name) for r in records], kind) for name, kind in names.items()})
+def record_table(kind: type, records: Sequence[object], /, **columns: pa.DataType | None) -> pa.Table:
+    """One row per record: the fields of a dataclass of text, numbers and booleans.
+
+    Args:
+        columns: Types of fields that have another one than their annotation; None leaves a field out.
+    """
+    types = {"str": pa.string(), "bool": pa.bool_(), "int": pa.int64(), "float": pa.float64()}
+    names = {each.name: getattr(each.type, "__name__", str(each.type)).removesuffix(" | None") for each in fields(kind)}
+    chosen = {name: columns[name] if name in columns else types[of] for name, of in names.items()}
+    return pa.table({name: pa.array([getattr(r, name) for r in records], of) for name, of in chosen.items() if of})
 
 
 def provenance(model: DifficultyModel) -> dict[str, Any]:

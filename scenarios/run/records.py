@@ -1,18 +1,234 @@
-"""A shift as it was recorded: readings, events, jobs, and the offers behind each award."""
+"""A shift as it was recorded: readings, events, jobs, the offers behind each award, and the schedule that follows."""
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any  # values of a card
+from itertools import zip_longest
+from math import isfinite
+from typing import Any, Literal  # Any: values of a card
 
 import numpy as np
 
 from fleet.engine.state import DONE, EXPIRED, GIVEN_UP, RUNNING, WAITING, State, World
+from fleet.errors import nearest
 from fleet.events import Event
 from fleet.observation import Observation
 from fleet.robot import ThermalLimits
 from fleet.telemetry import Telemetry
-from scenarios.run.schedule import Schedule, payloads, schedule
+
+Array = np.ndarray
+
+Outcome = Literal["finished", "returned", "given_up", "running"]
+
+_ORDER = (
+    "recover", "break_end", "finish", "give_back", "home", "break", "award", "fault", "failure", "return", "give_up",
+)  # fmt: skip
+"""The event kinds that determine a schedule, in the order in which they can occur at the same time."""
+
+SAME_MOMENT_DIGITS = 6
+"""Times are rounded to microseconds: the end of a tick and the start of the next may differ in the last bit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobSpan:
+    """One arm on one job, from the award until it is at home or faults."""
+
+    arm: str
+    job: str
+    start_s: float
+    end_s: float
+    """Time of arrival at home or of the fault; at most the horizon."""
+    finished_s: float | None = None
+    """End of the last cycle; None if not reached."""
+    outcome: Outcome
+    """finished: all cycles done, even if the arm was not at home yet; returned: back in the queue, after a fault,
+    by the policy, or because a live arm had to return it;
+    given_up: abandoned after too many faults."""
+    late_s: float | None = None
+    """Tardiness of a finished job; 0 if on time."""
+    faulted: bool = True
+    """Whether a fault was the reason that the job was returned or abandoned."""
+    cycles_kept: int | None = None
+    """Cycles of a returned or abandoned job that this arm has done and that count."""
+    difficulty: float = float("nan")
+    """Of the job for the arm, at the award."""
+    prediction: str = ""
+    """Predicted peak temperature and P(saturation) at the award, in words."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outage:
+    """Time of one arm lost to a fault or another failure, or in a break."""
+
+    arm: str
+    start_s: float
+    end_s: float
+    """Time of recovery, or the horizon."""
+    kind: Literal["fault", "failure", "break"] = "fault"
+    joint: int = 0
+    """Motor that caused a fault, 1..7."""
+    recovered: bool
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Assignments, outages and breaks up to a horizon, in order of the arms, then of time."""
+
+    assignments: tuple[JobSpan, ...]
+    outages: tuple[Outage, ...]
+    horizon_s: float
+    breaks: tuple[Outage, ...] = ()
+    """An arm may still finish a cycle or a job in them."""
+
+    def at(self, arm: str, time_s: float, job: str = "") -> JobSpan | None:
+        """The work of an arm at a time; with a job, only that one."""
+        own = (span for span in self.assignments if span.arm == arm and job in ("", span.job))
+        return next((span for span in own if span.start_s <= time_s <= span.end_s), None)
+
+
+def schedule(events: Sequence[Event], arms: Sequence[str], horizon_s: float) -> Schedule:
+    """Schedule of an event log; the order of events within the log does not matter.
+
+    Args:
+        horizon_s: End of the log; open assignments and outages last until then.
+
+    Raises:
+        ValueError: an arm that is not in the fleet, or an impossible sequence (an award to a busy arm, an arrival
+            home without a finished job).
+    """
+    own: dict[str, list[Event]] = {arm: [] for arm in arms}
+    for event in events:
+        if event.kind not in _ORDER:
+            continue
+        if event.arm not in own:
+            raise ValueError(f"No arm '{event.arm}' in this fleet{nearest(event.arm, own)}")
+        own[event.arm].append(event)
+    assignments: list[JobSpan] = []
+    outages: list[Outage] = []
+    breaks: list[Outage] = []
+    for arm, log in own.items():
+        log.sort(key=lambda e: (round(e.time_s, SAME_MOMENT_DIGITS), _ORDER.index(e.kind)))
+        assignments += _assignments(arm, log, horizon_s)
+        outages += _outages(arm, log, horizon_s)
+        breaks += _breaks(arm, log, horizon_s)
+    return Schedule(tuple(assignments), tuple(outages), horizon_s, tuple(breaks))
+
+
+def payloads(telemetry: Telemetry, plan: Schedule, arms: Sequence[str], payload_of: Mapping[str, float]) -> Array:
+    """Payloads in the hands, kg, [sample, arm].
+
+    Args:
+        plan: Which arm worked on what.
+        payload_of: Payload of each job, kg; none for others.
+    """
+    load_kg = np.zeros(telemetry.mode.shape, np.float32)
+    for work in plan.assignments:
+        rows = slice(*np.searchsorted(telemetry.time_s, (work.start_s, work.finished_s or work.end_s)))
+        load_kg[rows, arms.index(work.arm)] = payload_of.get(work.job, 0.0)
+    return load_kg
+
+
+def _assignments(arm: str, log: Sequence[Event], horizon_s: float) -> list[JobSpan]:
+    """Assignments of one arm, from its events in order."""
+    out: list[JobSpan] = []
+    award: Event | None = None
+    finish: Event | None = None
+    given_back: Event | None = None
+    stopped = False  # by a fault, away from home
+    for i, event in enumerate(log):
+        if event.kind == "award":
+            if award is not None:
+                raise ValueError(f"{_at(event)}: '{arm}' is awarded '{event.job}' while at '{award.job}'.")
+            award, finish, given_back, stopped = event, None, None, False
+        elif event.kind == "finish":
+            if award is None or award.job != event.job:
+                raise ValueError(f"{_at(event)}: '{arm}' finishes '{event.job}', which it was not awarded.")
+            finish = event
+        elif event.kind == "give_back" and award is not None and award.job == event.job:
+            given_back = event
+        elif event.kind == "home" and not stopped and award is not None and given_back is not None:
+            out.append(replace(_assignment(award, None, event.time_s, "returned", given_back), faulted=False))
+            award = None
+        elif event.kind == "home" and not stopped:
+            if award is None or finish is None:
+                raise ValueError(f"{_at(event)}: '{arm}' is home from '{event.job}', which it did not finish.")
+            out.append(_assignment(award, finish, event.time_s, "finished"))
+            award = None
+        elif event.kind in ("fault", "failure") and award is not None:
+            ends = (e for e in log[i + 1 :] if e.kind in ("return", "give_up") and e.job == award.job)
+            after = given_back or next(ends, None)
+            outcome = "given_up" if after and after.kind == "give_up" else "returned"
+            stretch = _assignment(award, finish, event.time_s, outcome, after)
+            out.append(replace(stretch, faulted=event.kind == "fault"))
+            award, stopped = None, True
+        elif (
+            event.kind == "return" and award is not None and award.job == event.job
+        ):  # in a live fleet, without a fault
+            out.append(replace(_assignment(award, finish, event.time_s, "returned", event), faulted=False))
+            award = None
+    if award is not None:
+        out.append(_assignment(award, finish, max(horizon_s, award.time_s), "running"))
+    return out
+
+
+def _assignment(
+    award: Event, finish: Event | None, end_s: float, outcome: Outcome, returned: Event | None = None
+) -> JobSpan:
+    return JobSpan(
+        arm=award.arm,
+        job=award.job,
+        start_s=award.time_s,
+        end_s=end_s,
+        finished_s=finish.time_s if finish else None,
+        outcome="finished" if finish else outcome,
+        late_s=finish.value if finish else None,
+        cycles_kept=round(returned.value) if returned and not finish and isfinite(returned.value) else None,
+        difficulty=award.value,
+        prediction=award.reason,
+    )
+
+
+def _outages(arm: str, log: Sequence[Event], horizon_s: float) -> list[Outage]:
+    """Outages of one arm, from its events in order."""
+    changes = [event for event in log if event.kind in ("fault", "failure", "recover")]
+    for i, event in enumerate(changes):
+        if event.kind != "recover" and i % 2:
+            raise ValueError(f"{_at(event)}: '{arm}' faults while it is faulted.")
+        if event.kind == "recover" and not i % 2:
+            raise ValueError(f"{_at(event)}: '{arm}' recovers without a fault.")
+    return [
+        Outage(
+            arm=arm,
+            start_s=fault.time_s,
+            end_s=recovery.time_s if recovery else max(horizon_s, fault.time_s),
+            kind="fault" if fault.kind == "fault" else "failure",
+            joint=fault.joint,
+            recovered=recovery is not None,
+            reason=fault.reason,
+        )
+        for fault, recovery in zip_longest(changes[::2], changes[1::2])
+    ]
+
+
+def _breaks(arm: str, log: Sequence[Event], horizon_s: float) -> list[Outage]:
+    """Breaks of one arm, from its events in order; the log of one that began before may lack its begin."""
+    out: list[Outage] = []
+    begin_s: float | None = 0.0
+    for event in log:
+        if event.kind == "break":
+            begin_s = event.time_s
+        elif event.kind == "break_end" and begin_s is not None:
+            out.append(Outage(arm=arm, start_s=begin_s, end_s=event.time_s, kind="break", recovered=True))
+            begin_s = None
+    if begin_s:
+        out.append(Outage(arm=arm, start_s=begin_s, end_s=max(horizon_s, begin_s), kind="break", recovered=False))
+    return out
+
+
+def _at(event: Event) -> str:
+    return f"Event log at {event.time_s:g} s"
+
 
 JOB_STATES = {WAITING: "waiting", RUNNING: "running", DONE: "finished", GIVEN_UP: "given_up", EXPIRED: "expired"}
 
@@ -100,8 +316,15 @@ class ShiftLog:
         horizon_s = float(self.card.get("scenario", {}).get("horizon_s", 0.0))
         return schedule(self.events, self.arms, max(ends_s, default=horizon_s))
 
+    def offers_behind(self, job: str, arm: str, time_s: float) -> tuple[Offer, ...]:
+        """Offers of all arms at the award of a job to an arm; in a recording its time is that of another clock, so the
+        award nearest the time is meant."""
+        times_s = [each.time_s for each in self.offers if each.awarded and (each.job, each.arm) == (job, arm)]
+        award_s = min(times_s, key=lambda each: abs(each - time_s), default=None)
+        return tuple(each for each in self.offers if (each.job, each.time_s) == (job, award_s))
+
     @cached_property
-    def load_kg(self) -> np.ndarray:
+    def load_kg(self) -> Array:
         """Payload in each hand, kg, [sample, arm]."""
         return payloads(self.readings, self.plan, self.arms, {job.job: job.payload_kg for job in self.jobs})
 

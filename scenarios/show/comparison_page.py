@@ -13,7 +13,7 @@ from scenarios.evaluate.comparison import Comparison, Failed, by_reward
 from scenarios.evaluate.scores import FEWEST, HEADS, Normalised, SuiteScores, ranked, score_cells, scores_of
 from scenarios.evaluate.statistics import LEGEND, LEVEL, Interval, profile
 from scenarios.policy_loader import is_on_bus, label
-from scenarios.show.page import AXIS, LAYOUT, Chart, Figure, Page, plain
+from scenarios.show.page import LAYOUT, LEGEND_ABOVE, Chart, Figure, Page, axis, named_rows, plain
 from scenarios.show.words import value_text
 from scenarios.table import Column, Table
 
@@ -40,12 +40,8 @@ DASHES, SYMBOLS = ("solid", "dash", "dot", "dashdot"), ("circle", "square", "dia
 HEIGHT_PX, ROW_PX = 428, 24
 """Of a chart with a legend, and of a row of `spans`."""
 MARGIN = {"l": 60, "r": 20, "t": 12, "b": 48}
-LEGEND_ABOVE: dict[str, Any] = {
-    "height": HEIGHT_PX,
-    "margin": MARGIN | {"t": 40},
-    "showlegend": True,
-    "legend": {"orientation": "h", "x": 0, "y": 1.02, "xanchor": "left", "yanchor": "bottom"},
-}
+WITH_LEGEND: dict[str, Any] = LAYOUT | {"height": HEIGHT_PX, "margin": MARGIN | {"t": 40}, "legend": LEGEND_ABOVE}
+WITH_LEGEND |= {"showlegend": True}
 NAME = 28
 """Most characters of a policy's name in a chart."""
 
@@ -339,12 +335,7 @@ def spans(rows: Sequence[tuple[str, float, float, float]], title: str, *, least:
         "layout": LAYOUT
         | {"height": MARGIN["t"] + ROW_PX * len(rows) + MARGIN["b"], "margin": MARGIN}
         | {"annotations": cut, "showlegend": False}
-        | {
-            "xaxis": AXIS | {"range": [low - room, high + room], "title": {"text": title}},
-            "yaxis": AXIS
-            | {"tickvals": at[:, 0].tolist(), "ticktext": labels, "range": [len(rows) - 0.5, -0.5]}
-            | {"automargin": True, "showgrid": False},
-        },
+        | {"xaxis": axis(title, range=[low - room, high + room]), "yaxis": named_rows(labels)},
     }
 
 
@@ -375,10 +366,7 @@ def lines(
         curves.append({"type": "scatter", "mode": "lines", "name": plain(name, NAME), **curve})
     return {
         "data": [*bands, *curves],
-        "layout": LAYOUT
-        | LEGEND_ABOVE
-        | {"xaxis": AXIS | {"range": [x[0], x[-1]], "title": {"text": x_title}}}
-        | {"yaxis": AXIS | {"range": [0, 1.02], "title": {"text": y_title}}},
+        "layout": WITH_LEGEND | {"xaxis": axis(x_title, range=[x[0], x[-1]]), "yaxis": axis(y_title, range=[0, 1.02])},
     }
 
 
@@ -392,8 +380,7 @@ def points(rows: Sequence[tuple[str, Range, Range]], x_title: str, y_title: str)
     for n, (name, x, y) in enumerate(rows):
         marker = {"color": COLOURS[n % len(COLOURS)], "symbol": SYMBOLS[n // len(COLOURS) % len(SYMBOLS)], "size": 9}
         data.append(_dots(np.array([x]), np.array([y]), [name], {"name": plain(name, NAME), "marker": marker}))
-    axes = {"xaxis": AXIS | {"title": {"text": x_title}}, "yaxis": AXIS | {"title": {"text": y_title}}}
-    return {"data": data, "layout": LAYOUT | LEGEND_ABOVE | axes}
+    return {"data": data, "layout": WITH_LEGEND | {"xaxis": axis(x_title), "yaxis": axis(y_title)}}
 
 
 def _dots(x: Array, y: Array, names: Sequence[str], look: dict[str, Any]) -> dict[str, Any]:
@@ -403,9 +390,9 @@ def _dots(x: Array, y: Array, names: Sequence[str], look: dict[str, Any]) -> dic
         x, y: Value, low and high of each point, [point, 3]; NaN for an unknown end.
     """
     trace: dict[str, Any] = {"type": "scatter", "mode": "markers", "x": x[:, 0].tolist(), "y": y[:, 0].tolist()}
-    for axis, values in (("x", x), ("y", y)):
+    for name, values in (("x", x), ("y", y)):
         below, above = np.nan_to_num(np.abs(values[:, 1:] - values[:, :1]), posinf=0.0).T.tolist()
         bars = {"type": "data", "symmetric": False, "array": above, "arrayminus": below, "thickness": 1.5, "width": 0}
-        trace[f"error_{axis}"] = bars
+        trace[f"error_{name}"] = bars
     hover = {"customdata": [plain(name) for name in names], "hovertemplate": "%{customdata}: %{x:.3~f}<extra></extra>"}
     return trace | hover | look

@@ -8,7 +8,7 @@ import numpy as np
 
 from fleet.robot import JOINTS, ThermalLimits
 from scenarios.show.comparison_page import COLOURS
-from scenarios.show.page import AXIS, GRID, INK, LAYOUT, Chart, Page, Section
+from scenarios.show.page import GRID, INK, LAYOUT, LEGEND_ABOVE, Chart, Section, axis, sections_page
 from scenarios.show.words import duration
 from scenarios.table import Column, Table
 from twin.logs.recording import Recording
@@ -32,12 +32,13 @@ def summary(found: ThermalForecast, so_far: Recording, repetitions: int) -> list
         f"After {_times(repetitions)}, {duration(found.run_s)}, joint {hottest + 1} is the hottest: "
         f"{middle[hottest]:.1f} °C (95 % interval {low[hottest]:.1f} to {high[hottest]:.1f}), now "
         f"{so_far_c(so_far)[hottest]:.1f} °C.",
-        f"P(a motor reaches {warning_c:g} °C) {_equals(found.probability(warning_c))}; "
-        f"P({error_c:g} °C) {_equals(found.probability(error_c))}.",
+        f"P(a motor reaches {warning_c:g} °C) {_p(found, warning_c)}; P({error_c:g} °C) {_p(found, error_c)}.",
     ]
     longest_s, warmer_k = found.longest_s(warning_c), found.safe_start_k(warning_c)
     simulated = duration(float(found.time_s[-1]))
-    run = f"more than {simulated}" if math.isinf(longest_s) else _run(longest_s, found.cycle_s)
+    run = f"more than {simulated}" if math.isinf(longest_s) else "none, a motor is already there"
+    if 0 < longest_s < math.inf:
+        run = f"{duration(longest_s)}, {_times(int(longest_s / found.cycle_s))}"
     sentences.append(f"Longest run in which P({warning_c:g} °C) is at most {100 * RISK:g} %: {run}.")
     if math.isinf(warmer_k):
         sentences.append(f"No start is safe: P({warning_c:g} °C) is higher even from an arm at {found.ambient_c:g} °C.")
@@ -58,20 +59,10 @@ def so_far_c(so_far: Recording) -> Array:
     return so_far.temp_c[-1]
 
 
-def _p(probability: float) -> str:
-    least = 1.0 / SAMPLES
-    return f"< {least:g}" if probability < least else f"{probability:.2f}"
-
-
-def _equals(probability: float) -> str:
-    shown = _p(probability)
-    return shown if shown.startswith("<") else f"= {shown}"
-
-
-def _run(longest_s: float, cycle_s: float) -> str:
-    if longest_s == 0:
-        return "none, a motor is already there"
-    return f"{duration(longest_s)}, {_times(int(longest_s / cycle_s))}"
+def _p(found: ThermalForecast, limit_c: float) -> str:
+    """Probability of reaching a limit in the run: `= 0.12`, or `<` the least that the samples resolve."""
+    probability, least = found.probability(limit_c), 1.0 / SAMPLES
+    return f"< {least:g}" if probability < least else f"= {probability:.2f}"
 
 
 def _times(repetitions: int) -> str:
@@ -105,7 +96,7 @@ def limit_table(found: ThermalForecast) -> Table:
         rows.append(
             (
                 f"{limit_c:g} °C",
-                _p(found.probability(limit_c)),
+                _p(found, limit_c).removeprefix("= "),
                 *("–" if math.isinf(s) else duration(s) for s in (early_s, middle_s)),
                 f"> {duration(float(found.time_s[-1]))}" if math.isinf(longest_s) else duration(longest_s),
             )
@@ -155,10 +146,7 @@ def page(found: ThermalForecast, so_far: Recording, repetitions: int, origin: Ma
         charts=(_chart(found, so_far),),
         tables=(limit_table(found), joint_table(found, so_far)),
     )
-    facts = Table(head=("", ""), rows=tuple(origin.items()), numbers=False)
-    content = {"lead": (), "sections": [section], "failed": [], "origin": facts}
-    title = f"Thermal forecast after {so_far.name}"
-    return Page(title=title, template="sections.html", content=content, charts=section.charts, narrow=True).html()
+    return sections_page(f"Thermal forecast after {so_far.name}", [section], origin)
 
 
 def _chart(found: ThermalForecast, so_far: Recording) -> Chart:
@@ -197,9 +185,9 @@ def _chart(found: ThermalForecast, so_far: Recording) -> Chart:
     layout = LAYOUT | {
         "height": 430,
         "margin": {"l": 55, "r": 15, "t": 60, "b": 50},
-        "legend": {"orientation": "h", "x": 0, "y": 1.02, "xanchor": "left", "yanchor": "bottom"},
-        "xaxis": AXIS | {"title": {"text": "minutes from the end of the log"}},
-        "yaxis": AXIS | {"title": {"text": "motor temperature, °C"}},
+        "legend": LEGEND_ABOVE,
+        "xaxis": axis("minutes from the end of the log"),
+        "yaxis": axis("motor temperature, °C"),
         "shapes": [*(_rule("x", "y", c, "#b00020") for c in shown_c), _rule("y", "x", 0.0, GRID)],
         "annotations": [
             {"xref": "paper", "x": 1, "xanchor": "right", "y": c, "yanchor": "bottom", "showarrow": False}

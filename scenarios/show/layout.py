@@ -91,9 +91,9 @@ def layout_report(scenario: Scenario, progress: Progress = quiet) -> LayoutRepor
     space = space_of(scenario, [arm.hardware.robot for arm in arms], plans, folder, progress)
     exclusions = _exclusions(scenario, plans, space)
     at_once, largest = _most_at_once(scenario, plans, space)
-    pairs = _pairs_of_arms(plans)
     volumes, conflicts = space.rows(plans)
-    close = conflicts[np.ix_(volumes, volumes)][pairs]
+    of_arm = np.array([plan.arm for plan in plans])
+    close = conflicts[np.ix_(volumes, volumes)][np.triu(of_arm[:, None] != of_arm)]
     return LayoutReport(
         scenario=scenario.name,
         clearance_m=scenario.clearance_m,
@@ -106,7 +106,7 @@ def layout_report(scenario: Scenario, progress: Progress = quiet) -> LayoutRepor
     )
 
 
-def layout_tables(scenario: Scenario, report: LayoutReport) -> tuple[list[Table], str]:
+def layout_parts(scenario: Scenario, report: LayoutReport) -> list[Table | str]:
     """Reach matrix, reasons and exclusions; and the most arms at work at once, in a sentence."""
     arms = [arm.name for arm in scenario.arms]
     reach = {(entry.place, entry.arm): entry for entry in report.reach}
@@ -114,7 +114,8 @@ def layout_tables(scenario: Scenario, report: LayoutReport) -> tuple[list[Table]
         caption=f"{scenario.name}: heaviest payload (kg) of the jobs that an arm can do at a place; –: it can do none",
         head=("place", *arms),
         rows=tuple(
-            (place.name, *(_payload(reach[place.name, arm].payload_kg) for arm in arms)) for place in scenario.places
+            (place.name, *("–" if (kg := reach[place.name, arm].payload_kg) is None else f"{kg:g}" for arm in arms))
+            for place in scenario.places
         ),
         numbers=False,
     )
@@ -147,11 +148,7 @@ def layout_tables(scenario: Scenario, report: LayoutReport) -> tuple[list[Table]
         + (f", for example {most}." if most else ".")
         + ("" if report.largest else f" The search for more ended after {SEARCH_S:g} s.")
     )
-    return [matrix, reasons, pairs], sentence
-
-
-def _payload(payload_kg: float | None) -> str:
-    return "–" if payload_kg is None else f"{payload_kg:g}"
+    return [matrix, reasons, pairs, sentence]
 
 
 def _reach(scenario: Scenario, arm: PlannedArm, place: str) -> Reach:
@@ -172,12 +169,6 @@ def _reach(scenario: Scenario, arm: PlannedArm, place: str) -> Reach:
 def shoulder_m(robot: Robot) -> Array:
     """Position of an arm's joint 2, the centre of its reach, m, [3]."""
     return np.array(robot.mount.position_m) + SHOULDER_M * robot.mount.rotation()[:, 2]
-
-
-def _pairs_of_arms(plans: Sequence[Plan]) -> Array:
-    """Which pairs of plans are of two arms, each pair once, bool [plan, plan]."""
-    arms = np.array([plan.arm for plan in plans])
-    return np.triu(arms[:, None] != arms)
 
 
 def _streams(scenario: Scenario, plans: Sequence[Plan]) -> list[str]:

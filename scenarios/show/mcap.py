@@ -97,7 +97,7 @@ class _McapFile:
             transform(WORLD, frames[0], arm["position"], arm["quaternion"])
             for arm, frames in zip(model["arms"], self.frames, strict=True)
         ]
-        links = [each for arm in range(len(self.arms)) for each in self.link_transforms(arm, 0)]
+        links = self.link_transforms()
         self.put("/tf_static", TRANSFORMS, begin_s, write(message(TRANSFORMS, transforms=mounts), TRANSFORMS), LATCHED)
         self.put("/tf", TRANSFORMS, begin_s, write(message(TRANSFORMS, transforms=links), TRANSFORMS))
         markers = []
@@ -120,12 +120,13 @@ class _McapFile:
                 content = message(TEMPERATURE, header=header(time_s), temperature=float(limit_c))
                 self.put(f"/limits/{name}", TEMPERATURE, time_s, write(content, TEMPERATURE))
 
-    def link_transforms(self, arm: int, sample: int) -> list[Any]:
-        """Transforms of the links above the first."""
-        turned = self.moments.link_quaternions(self.moments.run.readings.q[sample, arm])
-        frames, links = self.frames[arm], self.moments.model["links"]
+    def link_transforms(self) -> list[Any]:
+        """Transforms of the links above the first of each arm, as at the beginning."""
+        links = self.moments.model["links"]
+        turned = self.moments.link_quaternions(self.moments.run.readings.q[0])
         return [
-            transform(frames[link["parent"]], frames[i], link["position"], turned[i])
+            transform(frames[link["parent"]], frames[i], link["position"], turned[arm, i])
+            for arm, frames in enumerate(self.frames)
             for i, link in enumerate(links)
             if link["parent"] >= 0
         ]
@@ -135,7 +136,7 @@ class _McapFile:
         moments, readings = self.moments, self.moments.run.readings
         names = joint_names(readings.q.shape[2])
         moving = [i for i, link in enumerate(moments.model["links"]) if link["parent"] >= 0]
-        stamped = [each for arm in range(len(self.arms)) for each in self.link_transforms(arm, 0)]
+        stamped = self.link_transforms()
         everything = message(TRANSFORMS, transforms=stamped)
         for sample in moments.poses.tolist():
             time_s = float(readings.time_s[sample])

@@ -47,6 +47,18 @@ LAYOUT = {
 }
 """Of every figure; a dark page changes its colours."""
 AXIS = {"showgrid": True, "gridcolor": GRID, "zeroline": False, "linecolor": FRAME, "ticks": "outside"}
+LEGEND_ABOVE = {"orientation": "h", "x": 0, "y": 1.02, "xanchor": "left", "yanchor": "bottom"}
+
+
+def axis(title: str, **more: Any) -> dict[str, Any]:
+    """An axis with a title; `more` in Plotly's schema."""
+    return AXIS | {"title": {"text": title}} | more
+
+
+def named_rows(names: Sequence[str], **more: Any) -> dict[str, Any]:
+    """A y axis of rows with names, the first at the top; `more` in Plotly's schema."""
+    ticks = {"tickvals": list(range(len(names))), "ticktext": list(names), "range": [len(names) - 0.5, -0.5]}
+    return AXIS | ticks | {"automargin": True, "showgrid": False} | more
 
 
 def plain(text: str, most: int | None = None) -> str:
@@ -140,6 +152,23 @@ class Page:
         start = f'async function start(){{startFilters();{play}{draw}{join}document.body.dataset.ready="all";}}'
         failed = "start().catch((error)=>{document.title+=' (incomplete)';console.error(error);});"
         return f"{''.join(code)}\n{start}\n{failed}"
+
+
+def sections_page(
+    title: str, sections: Sequence[Section], origin: Table | Mapping[str, str], lead: Sequence[str] = ()
+) -> str:
+    """A page of sections as HTML text, which opens offline; the same input gives the same text.
+
+    Args:
+        origin: From what its figures come.
+        lead: First sentences.
+    """
+    if not isinstance(origin, Table):
+        origin = Table(head=("", ""), rows=tuple(origin.items()), numbers=False)
+    failed = [each.title for each in sections if each.failed]
+    charts = [chart for each in sections for chart in each.charts]
+    content = {"lead": lead, "sections": sections, "failed": failed, "origin": origin}
+    return Page(title=title, template="sections.html", content=content, charts=charts, narrow=True).html()
 
 
 @cache

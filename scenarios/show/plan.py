@@ -11,7 +11,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
-from matplotlib.transforms import IdentityTransform, ScaledTranslation
 
 from fleet.arm.kinematics import FOREARM_M, HAND_M, REACH_M, UPPER_ARM_M
 from fleet.env.render.picture import FAULT, INK, outlines
@@ -66,12 +65,8 @@ def _write_labels(axes: Axes, labels: Sequence[Label]) -> None:
     for label, (x, y) in zip(labels, points, strict=True):
         lines = label.text.split("\n")
         wide, high = 6.0 * max(map(len, lines)), 13.0 * len(lines)
-        sides = [
-            (x + 9, y - high / 2),
-            (x - 9 - wide, y - high / 2),
-            (x - wide / 2, y - 9 - high),
-            (x - wide / 2, y + 9),
-        ]
+        beside, below = (x + 9, x - 9 - wide), (y - 9 - high, y + 9)
+        sides = [*((each, y - high / 2) for each in beside), *((x - wide / 2, each) for each in below)]
 
         def covered(corner: tuple[float, float], wide: float = wide, high: float = high) -> float:
             """Area that a label at this lower left corner covers, px²."""
@@ -83,19 +78,9 @@ def _write_labels(axes: Axes, labels: Sequence[Label]) -> None:
 
         left, low = min(sides, key=covered)
         taken.append((left, low, left + wide, low + high))
-        text = axes.text(
-            float(label.at_m[0]),
-            float(label.at_m[1]),
-            label.text,
-            color=label.colour,
-            fontsize=8,
-            ha="center",
-            va="center",
-            zorder=5,
-        )
-        text.set_transform(
-            axes.transData + ScaledTranslation(left + wide / 2 - x, low + high / 2 - y, IdentityTransform())
-        )
+        aside = (left + wide / 2 - x, low + high / 2 - y)
+        how: Any = {"ha": "center", "va": "center", "color": label.colour, "fontsize": 8, "zorder": 5}
+        axes.annotate(label.text, tuple(label.at_m), aside, textcoords="offset pixels", **how)
 
 
 def _draw_cell(axes: Axes, scenario: Scenario, report: LayoutReport) -> list[Label]:

@@ -1,22 +1,33 @@
-"""The report of a shift in words, tables and figures; two shifts side by side; a run in a notebook."""
+"""The report of a shift in words, tables and figures; two shifts, or several, side by side; a run in a notebook."""
 
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any  # values of a card
+from statistics import median
+from typing import Any, NamedTuple  # Any: values of a card
 from urllib.parse import quote
+
+import numpy as np
 
 from fleet.env.render.heat import heat_scale
 from fleet.events import Event
-from scenarios.run.records import Offer, ShiftLog
-from scenarios.run.schedule import JobSpan, Schedule
-from scenarios.show.lateness import late_jobs, lateness_text
-from scenarios.show.page import Chart, Page, Playback, packed
-from scenarios.show.timeline import figure, hottest_motors, time_unit
-from scenarios.show.words import CANNOT, clock, duration, kind_text, names_text, scores_text, value_text
-from scenarios.table import Moment, Table, render
+from scenarios.run.records import JobSpan, Offer, Schedule, ShiftLog
+from scenarios.show.page import (
+    AXIS,
+    LAYOUT,
+    Chart,
+    Figure,
+    Page,
+    Playback,
+    named_rows,
+    packed,
+    plain,
+)
+from scenarios.show.timeline import POLICY_LINES, STREAM_NAME, figure, hottest_motors, stream_of, time_unit
+from scenarios.show.words import clock, duration, kind_text, names_text, offer_text, value_text
+from scenarios.table import Column, Moment, Table, render
 
 MOST_FAULTS = 2
 """Faults described in a sentence each."""
@@ -45,13 +56,13 @@ def verdict(log: ShiftLog) -> Verdict:
 
     Missing figures of its card are left out; without offers there is no sentence about other choices.
     """
-    metrics, plan, offers, faults = log.card.get("metrics") or {}, log.plan, log.offers, log.faults
+    metrics, plan, faults = log.card.get("metrics") or {}, log.plan, log.faults
     contacts = sum(event.kind == "contact" for event in log.events)
     about = {_fault(fault, plan): fault for fault in faults[:MOST_FAULTS]}
     moments = {sentence: _before(fault) for sentence, fault in about.items()}
     sentences = [*_jobs(metrics), *_outside_shift(log.card.get("scenario") or {})]
     for sentence, fault in about.items():
-        sentences += [sentence, *_cause(fault, plan, offers)]
+        sentences += [sentence, *_cause(fault, log)]
     if len(faults) > MOST_FAULTS:
         arms = sorted({fault.arm for fault in faults})
         sentences.append(f"{len(faults)} faults in all, of {names_text(arms)}: see the events below.")
@@ -62,7 +73,7 @@ def verdict(log: ShiftLog) -> Verdict:
         count = f"{len(failures)} failure{'s' * (len(failures) > 1)} not by heat"
         sentences.append(f"{count}: {names_text(arms)} out for {duration(out_s)} in all.")
     if log.policy != WEIGHS_PEAK:
-        sentences += _foreseen(faults, plan, offers)
+        sentences += _foreseen(log)
     if contacts:
         sentences.append(
             f"Arms touched something {f'{contacts} times' if contacts > 1 else 'once'}: see the events below."
@@ -119,30 +130,19 @@ def _fault(fault: Event, plan: Schedule) -> str:
     return f"{clock(fault.time_s)}: {fault.arm} stopped{at}, {loss}: {why}."
 
 
-def _award(fault: Event, plan: Schedule) -> JobSpan | None:
-    """The work in which an arm faulted."""
-    same = (a for a in plan.assignments if (a.arm, a.job) == (fault.arm, fault.job))
-    return next((a for a in same if a.start_s <= fault.time_s <= a.end_s), None)
-
-
-def _behind(award: JobSpan, offers: Sequence[Offer]) -> list[Offer]:
-    """The offers behind an award; in a live fleet they are a little older than its start."""
-    earlier = [offer for offer in offers if offer.job == award.job and offer.time_s <= award.start_s]
-    last_s = max((offer.time_s for offer in earlier), default=0.0)
-    return [offer for offer in earlier if offer.time_s == last_s]
-
-
-def _own_offer(award: JobSpan, offers: Sequence[Offer]) -> Offer | None:
+def _own_offer(award: JobSpan, log: ShiftLog) -> Offer | None:
     """The offer that got the job; None if its scores are unknown."""
-    own = next((o for o in _behind(award, offers) if o.awarded), None)
+    own = next((offer for offer in log.offers_behind(award.job, award.arm, award.start_s) if offer.awarded), None)
     return own if own is not None and own.peak_c is not None and own.p_saturation is not None else None
 
 
-def _foreseen(faults: Sequence[Event], plan: Schedule, offers: Sequence[Offer]) -> Iterable[str]:
+def _foreseen(log: ShiftLog) -> Iterable[str]:
     """How many faults were predicted, and what kind of policy avoids them."""
-    awards = [(fault, _award(fault, plan)) for fault in faults]
-    own = [(fault, _own_offer(award, offers)) for fault, award in awards if award is not None]
-    count = sum(offer is not None and (offer.peak_c or 0.0) >= _limit_c(fault) for fault, offer in own)
+    count, faults = 0, log.faults
+    for fault in faults:
+        award = log.plan.at(fault.arm, fault.time_s, fault.job)
+        own = _own_offer(award, log) if award else None
+        count += own is not None and (own.peak_c or 0.0) >= _limit_c(fault)
     if count:
         which = "The fault was" if len(faults) == 1 else f"{count} of {len(faults)} faults were"
         yield f"{which} predicted: a policy that weighs the predicted peak, such as {WEIGHS_PEAK}, avoids such awards."
@@ -152,14 +152,15 @@ def _limit_c(fault: Event) -> float:
     return fault.value if math.isfinite(fault.value) else math.inf
 
 
-def _cause(fault: Event, plan: Schedule, offers: Sequence[Offer]) -> Iterable[str]:
+def _cause(fault: Event, log: ShiftLog) -> Iterable[str]:
     """Why an arm faulted, as far as its award tells, and what would have avoided it."""
-    award = _award(fault, plan)
+    plan = log.plan
+    award = plan.at(fault.arm, fault.time_s, fault.job)
     if award is None:
         return
     begin_s = _begin(award, [a for a in plan.assignments if a.arm == fault.arm and a.start_s <= fault.time_s])
     pause = f"at work without a pause since {clock(begin_s)}; " if begin_s < award.start_s else ""
-    own = _own_offer(award, offers)
+    own = _own_offer(award, log)
     if own is None:
         if pause:
             yield f"Why: {pause}no prediction was recorded."
@@ -168,7 +169,7 @@ def _cause(fault: Event, plan: Schedule, offers: Sequence[Offer]) -> Iterable[st
         f"Why: {pause}at the award, {clock(award.start_s)}, predicted peak {own.peak_c:.0f} °C and P(saturation) "
         f"{own.p_saturation:.2f}."
     )
-    yield _avoidable(fault, own, _behind(award, offers), plan)
+    yield _avoidable(fault, own, log.offers_behind(award.job, award.arm, award.start_s), plan)
 
 
 def _begin(award: JobSpan, work: Sequence[JobSpan]) -> float:
@@ -201,15 +202,136 @@ def _occupied(offer: Offer, plan: Schedule) -> str:
     """Why an arm could not take a job, or until when."""
     if offer.state == "faulted":
         return "which was out after a fault"
-    current = next(
-        (a for a in plan.assignments if a.arm == offer.arm and a.start_s <= offer.time_s < a.end_s),
-        None,
-    )
-    if current is None:
+    current = plan.at(offer.arm, offer.time_s)
+    if current is None or current.end_s == offer.time_s:
         return "but its place or space was taken"
     if current.end_s >= plan.horizon_s:
         return "which was busy to the end"
     return f"once it was free, at {clock(current.end_s)}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LateJob:
+    """A job that passed its due date."""
+
+    job: str
+    due_s: float
+    late_s: float
+    """Tardiness; of an unfinished job until the end of the shift."""
+    state: str
+    """finished, waiting or running; or, of an abandoned job, given_up or expired."""
+
+    @property
+    def abandoned(self) -> bool:
+        """Whether it left the queue unfinished."""
+        return self.state in ("given_up", "expired")
+
+
+def late_jobs(log: ShiftLog) -> list[LateJob]:
+    """Jobs that passed their due date, finished or not: the latest first, abandoned ones last.
+
+    A recording of a live fleet states no due dates, so it has only those that finished late.
+    """
+    late = [
+        LateJob(job=event.job, due_s=event.time_s - event.value, late_s=event.value, state="finished")
+        for event in log.events
+        if event.kind == "finish" and event.value > 0
+    ]
+    late += [
+        LateJob(job=job.job, due_s=job.due_s, late_s=log.plan.horizon_s - job.due_s, state=job.state)
+        for job in log.jobs
+        if job.state != "finished" and job.due_s < log.plan.horizon_s
+    ]
+    return sorted(late, key=lambda each: (each.abandoned, -each.late_s, each.job))
+
+
+def lateness_text(log: ShiftLog, late: Sequence[LateJob]) -> str:
+    """The first of one or more late jobs with the reason, in a sentence, and the number of all."""
+    first, finished = late[0], sum(each.state == "finished" for each in late)
+    over = duration(first.late_s)
+    how = f"finished {over} late" if first.state == "finished" else f"is unfinished {over} after its due date"
+    if first.abandoned:
+        how = f"was abandoned, due at {clock(first.due_s)}"
+    if len(late) == 1:
+        return f"{first.job} {how}: {_reason(log, first)}."
+    counts = ((finished, "finished late"), (len(late) - finished, "unfinished at the due date"))
+    jobs = ", ".join(f"{number} {what}" for number, what in counts if number)
+    return f"Late jobs: {jobs}. The latest, {first.job}, {how}: {_reason(log, first)}."
+
+
+def _reason(log: ShiftLog, late: LateJob) -> str:
+    """What delayed a job most: its own work, or what the arms that can do it did while it waited."""
+    own = sorted((span for span in log.plan.assignments if span.job == late.job), key=lambda span: span.start_s)
+    for span in own:
+        if span.outcome in ("returned", "given_up"):
+            return f"{span.arm} {'faulted during' if span.faulted else 'returned'} it at {clock(span.end_s)}"
+    times_s = {event.kind: event.time_s for event in log.events if event.job == late.job}
+    begin_s = times_s.get("release")
+    if begin_s is None:
+        return "its release is not recorded"
+    end_s = own[0].start_s if own else times_s.get("expire", log.plan.horizon_s)
+    took_s = (own[0].finished_s or own[0].end_s) - end_s if own else 0.0
+    if begin_s + took_s > late.due_s:
+        return f"its work takes {duration(took_s)}, and it was due {duration(late.due_s - begin_s)} after its release"
+    offers = [offer for offer in log.offers if offer.job == late.job]
+    offers = offers or [offer for offer in log.offers if stream_of(offer.job) == stream_of(late.job)]
+    able = [arm for arm in log.arms if any(offer.feasible and offer.arm == arm for offer in offers)]
+    if not able:
+        return "no arm got a job of its kind"
+    waits_s = _arm_time(log, able, begin_s, end_s)
+    most = max(waits_s, key=lambda why: waits_s[why])
+    if not waits_s[most]:
+        return f"what {names_text(able)} did meanwhile is not recorded"
+    return _passed(log, late, able, begin_s, end_s) if most == "" else f"{names_text(able)} {most}"
+
+
+def _arm_time(log: ShiftLog, able: Sequence[str], begin_s: float, end_s: float) -> dict[str, float]:
+    """Time of the arms that can do a job between its release and its award, s, by what they did; "": later jobs."""
+    were = "were" if len(able) > 1 else "was"
+    earlier, out = f"{were} at work since before its release", f"{were} out after a fault"
+    failed, paused = f"{were} out after a failure", "had a break"
+    hot, idle = f"{were} idle above the warning limit", f"{were} idle: its place was taken, or the policy let it wait"
+    time_s: dict[str, float] = dict.fromkeys(("", earlier, out, failed, paused, hot, idle), 0.0)
+    at_s = log.readings.time_s
+    step_s = float(np.median(np.diff(at_s))) if len(at_s) > 1 else 0.0
+    for arm in able:
+        spans = [(s, earlier if s.start_s < begin_s else "") for s in log.plan.assignments if s.arm == arm]
+        spans += [(each, out if each.kind == "fault" else failed) for each in log.plan.outages if each.arm == arm]
+        spans += [(each, paused) for each in log.plan.breaks if each.arm == arm]
+        free = (at_s >= begin_s) & (at_s < end_s)
+        for span, why in spans:
+            time_s[why] += max(0.0, min(span.end_s, end_s) - max(span.start_s, begin_s))
+            free &= (at_s < span.start_s) | (at_s >= span.end_s)
+        peak_c = np.fmax.reduce(log.readings.temp_c[free, log.arms.index(arm)], axis=-1, initial=-math.inf)
+        time_s[hot] += step_s * float((peak_c >= log.limits.warning_c).sum())
+        time_s[idle] += step_s * float((peak_c < log.limits.warning_c).sum())
+    return time_s
+
+
+def _passed(log: ShiftLog, late: LateJob, able: Sequence[str], begin_s: float, end_s: float) -> str:
+    """How many jobs were awarded before a late one to arms that can do it, and what most of them have in common."""
+    ahead = [a for a in log.plan.assignments if a.arm in able and begin_s <= a.start_s < end_s and a.job != late.job]
+    records = {record.job: record for record in log.jobs}
+    took_s = {(o.arm, o.job, o.time_s): o.duration_s for o in log.offers if o.duration_s}
+    like = [s for (_, job, _), s in took_s.items() if job == late.job]
+    own = records.get(late.job)
+    if own is not None and not like:  # never awarded: by the time per cycle of jobs of its stream
+        alike = [(s, records[job]) for (_, job, _), s in took_s.items() if stream_of(job) == stream_of(late.job)]
+        like = [s / record.cycles * own.cycles for s, record in alike if record.cycles]
+    own_s = median(like) if like else 0.0
+    counts = dict.fromkeys(("shorter", "worth more", "due earlier", "worth more per minute"), 0)
+    for span in ahead:
+        span_s = took_s.get((span.arm, span.job, span.start_s), math.inf)
+        counts["shorter"] += span_s < own_s
+        if own is not None and (other := records.get(span.job)) is not None:
+            counts["worth more"] += other.value > own.value
+            counts["due earlier"] += other.due_s < own.due_s
+            counts["worth more per minute"] += other.value * own_s > own.value * span_s
+    most = max(counts, key=lambda trait: counts[trait])
+    share = "all" if counts[most] == len(ahead) else str(counts[most])
+    which = f", {share} of them {most}" if 2 * counts[most] > len(ahead) else ""
+    arms = [arm for arm in log.arms if any(span.arm == arm for span in ahead)]
+    return f"{len(ahead)} other job{'s' * (len(ahead) > 1)} went first on {names_text(arms)}{which}"
 
 
 ROWS = 300
@@ -302,25 +424,46 @@ def _settings(run: Mapping[str, Any], arms: Sequence[str]) -> list[str]:
     return how + [f"{name} {run[name]}" for name in ("plant", "bus", "difficulty") if run.get(name) is not None]
 
 
+class KeyFigure(NamedTuple):
+    """One of the most important metrics."""
+
+    label: str
+    name: str
+    """The metric."""
+    form: str
+    unit: str = ""
+    whole: str = ""
+    """The metric that it is a part of."""
+
+
 KEY_FIGURES = (
-    ("jobs finished", "finished", ",.4g", "", "jobs"),
-    ("value", "value", ",.4g", "", "value_offered"),
-    ("on time", "on_time", ",.4g", "", "finished"),
-    ("tardiness", "tardiness_min", ",.1f", " min", ""),
-    ("jobs per hour", "jobs_per_hour", ".1f", "", ""),
-    ("faults", "faults", ".0f", "", ""),
-    ("contacts", "contacts", ",.0f", "", ""),
-    ("above warning", "above_warning_min", ",.1f", " min", ""),
-    ("hottest motor", "hottest_c", ".1f", " °C", ""),
-    ("too hot to touch", "hot_surface_min", ",.1f", " min", ""),
-    ("availability", "availability", ".1%", "", ""),
-    ("utilisation", "utilisation", ".1%", "", ""),
-    ("energy to heat", "energy_wh", ",.0f", " Wh", ""),
-    ("tool drift", "most_drift_mm", ".2f", " mm", ""),
-    ("insulation used", "most_insulation_ppb", ",.3g", " ppb", ""),
-    ("claims lost to another arm", "lost_claims", ",.0f", "", ""),
+    KeyFigure("jobs finished", "finished", ",.4g", whole="jobs"),
+    KeyFigure("value", "value", ",.4g", whole="value_offered"),
+    KeyFigure("on time", "on_time", ",.4g", whole="finished"),
+    KeyFigure("tardiness", "tardiness_min", ",.1f", "min"),
+    KeyFigure("jobs per hour", "jobs_per_hour", ".1f"),
+    KeyFigure("faults", "faults", ".0f"),
+    KeyFigure("contacts", "contacts", ",.0f"),
+    KeyFigure("given up", "given_up", ",.0f"),
+    KeyFigure("expired", "expired", ",.0f"),
+    KeyFigure("above warning", "above_warning_min", ",.1f", "min"),
+    KeyFigure("hottest motor", "hottest_c", ".1f", "°C"),
+    KeyFigure("too hot to touch", "hot_surface_min", ",.1f", "min"),
+    KeyFigure("availability", "availability", ".1%"),
+    KeyFigure("utilisation", "utilisation", ".1%"),
+    KeyFigure("energy to heat", "energy_wh", ",.0f", "Wh"),
+    KeyFigure("tool drift", "most_drift_mm", ".2f", "mm"),
+    KeyFigure("insulation used", "most_insulation_ppb", ",.3g", "ppb"),
+    KeyFigure("claims lost to another arm", "lost_claims", ",.0f"),
 )
-"""Label, metric, format, unit, and the metric it is a part of."""
+MAIN_FIGURES = tuple(
+    each
+    for each in KEY_FIGURES
+    if each.name in ("finished", "value", "on_time", "faults", "above_warning_min", "hottest_c")
+)
+"""Those by which shifts are compared."""
+RARE = ("contacts", "given_up", "expired")
+"""At the head of a report only where there are some."""
 
 
 def key_figures(metrics: Mapping[str, Any]) -> list[Tile]:
@@ -329,11 +472,37 @@ def key_figures(metrics: Mapping[str, Any]) -> list[Tile]:
     hottest = max(peaks, key=lambda arm: peaks[arm], default="")
     tiles: list[Tile] = []
     for label, name, form, unit, whole in KEY_FIGURES:
-        if name in values and (name != "contacts" or values[name] > 0):
-            small = f" of {values[whole]:{form}}" if whole in values else f"{unit} {hottest * (name == 'hottest_c')}"
+        if name in values and (name not in RARE or values[name] > 0):
+            small = f" of {values[whole]:{form}}" if whole in values else f" {unit} {hottest * (name == 'hottest_c')}"
             bad = name in ("faults", "contacts") and values[name] > 0
             tiles.append(Tile(label, f"{values[name]:{form}}", small.rstrip(), bad))
     return tiles
+
+
+def figure_table(shifts: Mapping[str, Mapping[str, Any]], *, wholes: bool = False) -> Table:
+    """Key figures, a column for each shift's metrics by its name, and the second of two minus the first.
+
+    Args:
+        wholes: Say of what a figure is a part, as in `77 of 87`; without it, cells are plain numbers.
+    """
+    columns, rows = [numbers(metrics) for metrics in shifts.values()], list[tuple[str, ...]]()
+    for label, name, form, unit, whole in KEY_FIGURES:
+        form, percent = form.replace(",", "").replace("%", "f"), form.endswith("%")
+        if any(name in values for values in columns):
+            scaled = [values[name] * 100**percent if name in values else None for values in columns]
+            of = [f" of {values[whole]:{form}}" if wholes and whole in values else "" for values in columns]
+            texts = ["" if each is None else f"{each:{form}}{part}" for each, part in zip(scaled, of, strict=True)]
+            rows.append((str(Column(label, "%" if percent else unit)), *texts, *_difference(scaled, form)))
+    return Table(head=("", *shifts, *(["difference"] if len(shifts) == 2 else [])), rows=tuple(rows))
+
+
+def _difference(values: Sequence[float | None], form: str) -> list[str]:
+    """The second value less the first, as the last cell of a row of two; none in other rows."""
+    if len(values) != 2:
+        return []
+    first, second = values
+    change = "" if first is None or second is None else f"{second - first:+{form}}".replace("-", "−")
+    return ["0" if change and not float(change[1:]) else change]
 
 
 def _peaks(metrics: Mapping[str, Any]) -> dict[str, float]:
@@ -397,12 +566,12 @@ def _award_table(offers: Sequence[Offer], arms: Sequence[str]) -> Mapping[str, o
         winner = next(offer for offer in award if offer.awarded)
         if every_arm:
             of = {offer.arm: offer for offer in award}
-            cells = [_offer_text(of[arm]) if arm in of else "" for arm in arms]
+            cells = [offer_text(of[arm]) if arm in of else "" for arm in arms]
         else:
             others = sorted(
                 (o for o in award if o.free and not o.awarded), key=lambda o: (o.p_saturation or 0.0, o.arm)
             )
-            cells = [_offer_text(winner), *(f"{o.arm}: {_offer_text(o)}" for o in others[:3])]
+            cells = [offer_text(winner), *(f"{o.arm}: {offer_text(o)}" for o in others[:3])]
             cells += [""] * (4 - len(cells))
         rows.append((clock(winner.time_s), winner.job, winner.arm, *cells))
         moments.append(Moment(winner.time_s, winner.arm))
@@ -413,14 +582,6 @@ def _award_table(offers: Sequence[Offer], arms: Sequence[str]) -> Mapping[str, o
         "more": left if len(awards) > MOST_AWARDS else "",
         "rows": table.html(key="choices", moments=moments),
     }
-
-
-def _offer_text(offer: Offer) -> str:
-    if not offer.feasible:
-        return CANNOT
-    parts = [*scores_text(offer), f"{(offer.duration_s or 0.0) / 60:.0f} min"]
-    barred = "" if offer.free else f" ({offer.state if offer.state != 'idle' else 'place or space taken'})"
-    return ", ".join(parts) + barred
 
 
 def _request_table(requests: Sequence[Sequence[str]]) -> Table | None:
@@ -446,72 +607,11 @@ def _provenance(run: Mapping[str, Any]) -> Table:
     return Table(head=("", ""), rows=tuple(rows), numbers=False)
 
 
-MAIN_FIGURES = (
-    ("jobs finished", "finished", ".0f"),
-    ("value of finished jobs", "value", ".4g"),
-    ("jobs on time", "on_time", ".0f"),
-    ("faults", "faults", ".0f"),
-    ("minutes above the warning limit", "above_warning_min", ".1f"),
-    ("hottest motor, °C", "hottest_c", ".1f"),
-)
-"""Label, metric and format of the figures by which two shifts are compared."""
-
-
-def pair_table(logs: Mapping[str, ShiftLog]) -> Table:
-    """The main figures of two shifts by name, and the second minus the first; missing figures are left out."""
-    columns = [numbers(log.card.get("metrics") or {}) for log in logs.values()]
-    rows = list[tuple[str, ...]]()
-    for label, name, form in MAIN_FIGURES:
-        values = [column[name] for column in columns if name in column]
-        if len(values) == len(columns):
-            change = f"{values[1] - values[0]:+{form}}".replace("-", "−")
-            rows.append((label, *(f"{value:{form}}" for value in values), change if float(change[1:]) else "0"))
-    return Table(head=("", *logs, "difference"), rows=tuple(rows))
-
-
-def pair_page(
-    title: str, sentences: Sequence[str], reports: Mapping[str, ShiftLog], model: Mapping[str, Any] | None = None
-) -> str:
-    """Two shifts of the same jobs in the same cell as one HTML page: the hottest motors in one chart, the movements in
-    step, the main figures, and links to the reports.
-
-    The same input gives the same text.
-
-    Args:
-        sentences: What the page is about.
-        reports: The two shifts, each by the path of its report relative to the page.
-        model: As in `report_html`.
-    """
-    logs = {log.policy: log for log in reports.values()}
-    columns = [
-        {
-            "name": log.policy,
-            "verdict": verdict(log),
-            "first": next(map(_before, log.faults), None),
-            "other_choices": other_choices(log, other),
-            "tiles": key_figures(log.card.get("metrics") or {}),
-            "report": quote(path),
-        }
-        for (path, log), other in zip(reports.items(), [*reports.values()][::-1], strict=True)
-    ]
-    charts, replay = list[Chart](), None
-    if all(len(log.readings.time_s) for log in reports.values()):
-        alt = f"Hottest motor over the shift under {' and '.join(logs)}"
-        charts.append(Chart(key="hottest", figure=hottest_motors(logs), alt=alt))
-        replay = _playback([*reports.values()], model) if model else None
-    content = {
-        "sentences": sentences,
-        "sides": columns,
-        "charts": charts,
-        "replays": tuple(logs) if replay else (),
-        "table": pair_table(logs),
-    }
-    return Page(title=title, template="pair.html", content=content, charts=charts, replay=replay).html()
-
-
 def other_choices(log: ShiftLog, other: ShiftLog) -> list[str]:
-    """Of the job of each fault, what became of it in the other shift."""
+    """Of the job of each fault, what became of it in the other shift; nothing for the shift itself."""
     lines: list[str] = []
+    if other is log:
+        return lines
     for job in dict.fromkeys(fault.job for fault in log.faults if fault.job):
         own = [event for event in other.events if event.job == job]
         faults = [event for event in own if event.kind == "fault"]
@@ -523,3 +623,117 @@ def other_choices(log: ShiftLog, other: ShiftLog) -> list[str]:
             began = any(event.kind == "award" for event in own)
             lines.append(f"Under {other.policy}, {job} was not {'finished' if began else 'begun'}.")
     return lines
+
+
+BAR_PX, TITLE_PX = 24, 44
+"""Height of a bar, and of the title and the gap above the bars of a figure."""
+
+
+def runs_table(logs: Mapping[str, ShiftLog]) -> Table:
+    """Settings, outcome and key figures, a column for each run by its name; "" for a figure that a run lacks."""
+    settings = {
+        "scenario": [str(log.card.get("scenario", {}).get("name", "")) for log in logs.values()],
+        "policy": [log.policy for log in logs.values()],
+        "seed": [str(log.card.get("seed", "")) for log in logs.values()],
+        "predictions": [str(log.card.get("difficulty", "")) for log in logs.values()],
+        "outcome": [verdict(log).badge for log in logs.values()],
+    }
+    figures = figure_table({name: log.card.get("metrics") or {} for name, log in logs.items()})
+    rows = [(name, *cells, *([""] if len(logs) == 2 else [])) for name, cells in settings.items()]
+    return replace(figures, rows=(*rows, *figures.rows))
+
+
+def runs_page(
+    logs: Mapping[str, ShiftLog],
+    *,
+    title: str = "",
+    lead: Sequence[str] = (),
+    reports: Mapping[str, str] | None = None,
+    model: Mapping[str, Any] | None = None,
+) -> str:
+    """Shifts by name as one HTML page that opens offline; the same shifts give the same text.
+
+    It has key figures and what happened in each; of shifts with the same jobs also the hottest motors in one chart.
+
+    Args:
+        title, lead: Heading and first sentences; by default number and differences of the shifts.
+        reports: Paths of their reports relative to the page, by name.
+        model: As in `report_html`, of shifts in one cell: their movements are shown in step.
+    """
+    table = runs_table(logs)
+    settings = {row[0]: set(row[1 : len(logs) + 1]) for row in table.rows[:4]}
+    differ = [name for name, values in settings.items() if len(values) > 1]
+    equal_jobs = not {"scenario", "seed"} & {*differ}
+    jobs = "All have the same jobs." if equal_jobs else "They have other jobs: their figures compare no policies."
+    charts, replay = list[Chart](), None
+    if equal_jobs and all(len(log.readings.time_s) for log in logs.values()):
+        if len({log.limits for log in logs.values()}) == 1:
+            alt = f"Hottest motor over the shift under {', '.join(logs)}"
+            charts.append(Chart(key="hottest", figure=hottest_motors(logs), alt=alt))
+        replay = _playback([*logs.values()], model) if model else None
+    main = Chart(key="main", figure=bars(logs), alt=f"Main figures of {', '.join(logs)}; the table has them")
+    hashes = ("code_hash", "scenario_hash")
+    content = {
+        "sentences": lead or (f"The runs differ in {', '.join(differ) or 'nothing'}. {jobs}",),
+        "sides": [
+            {
+                "name": name,
+                "verdict": verdict(log),
+                "first": next(map(_before, log.faults), None),
+                "other_choices": [line for other in logs.values() for line in other_choices(log, other)]
+                if equal_jobs
+                else (),
+                "report": quote((reports or {}).get(name, "")),
+            }
+            for name, log in logs.items()
+        ],
+        "charts": charts,
+        "replays": tuple(logs) if replay else (),
+        "main": main,
+        "table": table,
+        "origin": Table(
+            head=("run", "hash of the code", "hash of the scenario"),
+            rows=tuple((name, *(str(log.card.get(key, "")) for key in hashes)) for name, log in logs.items()),
+            numbers=False,
+        ),
+    }
+    title = title or f"{len(logs)} runs{'' if 'scenario' in differ else f' of {table.rows[0][1]}'}"
+    return Page(title=title, template="runs.html", content=content, charts=[*charts, main], replay=replay).html()
+
+
+def bars(logs: Mapping[str, ShiftLog]) -> Figure:
+    """The main figures one below the other, each with a bar for each run."""
+    values = [numbers(log.card.get("metrics") or {}) for log in logs.values()]
+    shown = [each for each in MAIN_FIGURES if any(each.name in own for own in values)]
+    block_px = TITLE_PX + BAR_PX * len(logs)
+    height_px = block_px * max(1, len(shown))
+    names = [plain(name, STREAM_NAME) for name in logs]
+    data, layout, titles = list[dict[str, Any]](), dict[str, Any](), list[dict[str, Any]]()
+    for number, (label, name, form, unit, _) in enumerate(shown, start=1):
+        top = 1 - ((number - 1) * block_px + TITLE_PX) / height_px
+        own = [each.get(name) for each in values]
+        text = [f"{value:{form}}" if value is not None else "" for value in own]
+        axes = {"xaxis": f"x{number}", "yaxis": f"y{number}"}
+        look = {"color": [POLICY_LINES[k % len(POLICY_LINES)][0] for k in range(len(names))]}
+        data.append(
+            {"type": "bar", "orientation": "h", "x": own, "y": list(range(len(own))), "text": text, "marker": look}
+            | {
+                "hovertemplate": "%{text}<extra></extra>",
+                "textposition": "outside",
+                "textangle": 0,
+                "cliponaxis": False,
+                **axes,
+            }
+        )
+        layout[f"xaxis{number}"] = AXIS | {"anchor": f"y{number}", "rangemode": "tozero", "visible": False}
+        domain = [max(0.0, top - BAR_PX * len(logs) / height_px), top]
+        layout[f"yaxis{number}"] = named_rows(names, anchor=f"x{number}", domain=domain)
+        place = {"x": 0, "xref": "paper", "xanchor": "left", "y": top, "yref": "paper", "yanchor": "bottom"}
+        titles.append({"text": f"<b>{Column(label, unit)}</b>", "showarrow": False, **place})
+    margin = {"l": 60, "r": 48, "t": 4, "b": 12}
+    return {
+        "data": data,
+        "layout": LAYOUT
+        | layout
+        | {"height": height_px + 16, "margin": margin, "annotations": titles, "showlegend": False},
+    }

@@ -14,10 +14,9 @@ from fleet.env.render.heat import HEAT, heat_marks
 from fleet.events import Event
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import Telemetry
-from scenarios.run.records import ShiftLog
-from scenarios.run.schedule import JobSpan, Outage
+from scenarios.run.records import JobSpan, Outage, ShiftLog
 from scenarios.show import page
-from scenarios.show.page import AXIS, INK, plain
+from scenarios.show.page import AXIS, INK, axis, plain
 from scenarios.show.words import clock
 
 Array = np.ndarray
@@ -94,7 +93,6 @@ TEXT = {"xref": "paper", "xanchor": "left", "showarrow": False}
 def figure(log: ShiftLog) -> dict[str, Any]:
     """The figure: `data` and `layout` in Plotly's schema."""
     plan, telemetry, arms = log.plan, log.readings, log.arms
-    warning_c, error_c = log.limits.warning_c, log.limits.error_c
     unit, unit_s = time_unit(plan.horizon_s)
     bars = _gantt(log, unit_s)
     lanes = _lanes(telemetry, len(arms))
@@ -107,20 +105,12 @@ def figure(log: ShiftLog) -> dict[str, Any]:
     layout = LAYOUT | _blocks(arms, lanes, _legend_height(bars))
     layout["xaxis"] = time | {"anchor": "y"}
     layout["xaxis2"] = time | {"anchor": f"y{len(lanes) + 1}", "matches": "x"}
-    # NaN is ignored, and nothing copied.
-    low_c = float(np.fmin.reduce(telemetry.temp_c, axis=None, initial=warning_c - 20.0))
-    high_c = float(np.fmax.reduce(telemetry.temp_c, axis=None, initial=error_c))
-    room_k = 0.06 * (high_c - low_c)
-    temperature = AXIS | {
-        "range": [low_c - room_k, high_c + room_k],
-        "title": {"text": "°C", "standoff": 8},
-        "anchor": "x2",
-        "nticks": 6,
-    }
+    title = {"text": "°C", "standoff": 8}
+    temperature = AXIS | {"range": _range_c(telemetry.temp_c, log.limits), "title": title, "anchor": "x2", "nticks": 6}
     layout["shapes"] = []
     for lane in range(len(lanes)):
-        axis = f"yaxis{lane + 2}"
-        layout[axis] = temperature | layout[axis] | ({"matches": "y2"} if lane else {})
+        key = f"yaxis{lane + 2}"
+        layout[key] = temperature | layout[key] | ({"matches": "y2"} if lane else {})
         shapes, labels = _limit_lines(log.limits, f"y{lane + 2}")
         layout["shapes"] += shapes
         layout["annotations"] += labels
@@ -141,50 +131,52 @@ def hottest_motors(logs: Mapping[str, ShiftLog]) -> dict[str, Any]:
     """The hottest motor of the fleet over time in shifts with equal limits, by name: `data` and `layout`."""
     first = next(iter(logs.values()))
     unit, unit_s = time_unit(first.plan.horizon_s)
-    traces, ends_c = list[Trace](), [first.limits.warning_c - 20.0, first.limits.error_c]
+    traces, values = list[Trace](), list[Array]()
     for (name, log), (colour, dash) in zip(logs.items(), cycle(POLICY_LINES), strict=False):
         temp_c = log.readings.temp_c.reshape(len(log.readings.time_s), -1)  # NaN of an absent arm
         motor = np.nan_to_num(temp_c, nan=-np.inf).argmax(axis=1)
-        value = temp_c[np.arange(len(motor)), motor]
-        kept = decimate(value, POINTS_PER_TRACE)
-        ends_c += value[np.isfinite(value)].tolist()
-        texts = [f"{log.arms[m // JOINTS]}, joint {m % JOINTS + 1}" for m in motor[kept].tolist()]
-        traces.append(
-            {
-                "type": "scatter",
-                "mode": "lines",
-                "name": plain(name, STREAM_NAME),
-                "x": _packed(log.readings.time_s[kept] / unit_s),
-                "y": _packed(value[kept]),
-                "line": {"color": colour, "width": 2, "dash": dash},
-                "customdata": [plain(text) for text in texts],
-                "hovertemplate": f"{plain(name)}: %{{y:.1f}} °C at %{{x:.1f}} {unit}<br>%{{customdata}}<extra></extra>",
-            }
-        )
+        values.append(temp_c[np.arange(len(motor)), motor])
+        kept = decimate(values[-1], POINTS_PER_TRACE)
+        texts = [plain(f"{log.arms[m // JOINTS]}, joint {m % JOINTS + 1}") for m in motor[kept].tolist()]
+        hover = f"{plain(name)}: %{{y:.1f}} °C at %{{x:.1f}} {unit}<br>%{{customdata}}<extra></extra>"
+        line = {"color": colour, "width": 2, "dash": dash}
+        trace = _curve(plain(name, STREAM_NAME), log.readings.time_s[kept] / unit_s, values[-1][kept], line, hover)
+        traces.append(trace | {"customdata": texts})
     shapes, labels = _limit_lines(first.limits, "y")
-    low_c, high_c = min(ends_c), max(ends_c)
-    room_k = 0.06 * (high_c - low_c)
-    time = {"range": [0, first.plan.horizon_s / unit_s], "title": {"text": f"time ({unit})"}}
-    temperature = {"range": [low_c - room_k, high_c + room_k], "title": {"text": "hottest motor, °C"}}
+    time = axis(f"time ({unit})", range=[0, first.plan.horizon_s / unit_s])
+    temperature = axis("hottest motor, °C", range=_range_c(np.concatenate(values), first.limits))
     return {
         "data": traces,
         "layout": LAYOUT
         | {"height": 360, "margin": MARGIN | {"l": 60, "t": 36}, "showlegend": True, "legend": LEGEND | {"y": 1.02}}
         | {"modebar": {"orientation": "h"}}
-        | {"xaxis": AXIS | time, "yaxis": AXIS | temperature, "shapes": shapes, "annotations": labels},
+        | {"xaxis": time, "yaxis": temperature, "shapes": shapes, "annotations": labels},
     }
 
 
-def _limit_lines(limits: ThermalLimits, axis: str) -> tuple[list[Trace], list[Trace]]:
+def _range_c(temp_c: Array, limits: ThermalLimits) -> list[float]:
+    """Range of an axis with these temperatures (NaN of absent arms) and both limits, °C."""
+    low_c = float(np.fmin.reduce(temp_c, axis=None, initial=limits.warning_c - 20.0))
+    high_c = float(np.fmax.reduce(temp_c, axis=None, initial=limits.error_c))
+    room_k = 0.06 * (high_c - low_c)
+    return [low_c - room_k, high_c + room_k]
+
+
+def _curve(name: str, time: Array, value: Array, line: Trace, hover: str) -> Trace:
+    look = {"type": "scatter", "mode": "lines", "name": name, "line": line, "hovertemplate": hover}
+    return look | {"x": _packed(time), "y": _packed(value)}
+
+
+def _limit_lines(limits: ThermalLimits, y: str) -> tuple[list[Trace], list[Trace]]:
     """Lines of the limits over the whole width of a y axis, and their labels."""
     lines, labels = list[Trace](), list[Trace]()
     for name, limit_c, colour, anchor, dash in (
         ("error", limits.error_c, FAULT, "bottom", "solid"),
         ("warning", limits.warning_c, WARNING, "top", "longdash"),
     ):
-        at = {"yref": axis, "y0": limit_c, "y1": limit_c, "xref": "paper", "x0": 0, "x1": 1}
+        at = {"yref": y, "y0": limit_c, "y1": limit_c, "xref": "paper", "x0": 0, "x1": 1}
         lines.append(at | {"type": "line", "line": {"color": colour, "width": 1, "dash": dash}})
-        aside = {"x": 1, "xshift": 4, "y": limit_c, "yref": axis, "yanchor": anchor, "font": {"size": 10}}
+        aside = {"x": 1, "xshift": 4, "y": limit_c, "yref": y, "yanchor": anchor, "font": {"size": 10}}
         label = {"text": f"{name} {limit_c:g} °C", "yshift": -5 if anchor == "bottom" else 5}
         labels.append(TEXT | aside | label)
     return lines, labels
@@ -244,7 +236,8 @@ def _work_bars(log: ShiftLog, unit_s: float) -> list[Trace]:
                 "color": [LATE["color"] if a.late_s else "white" for a in own],
                 "width": [LATE["width"] if a.late_s else 0.6 for a in own],
             },
-            "pattern": HATCH | {"shape": [_shape(a) for a in own]},
+            # For people who see no colours and for dark pages, which show no dark outline.
+            "pattern": HATCH | {"shape": ["/" if a.outcome == "returned" else "." if a.late_s else "" for a in own]},
         }
         traces.append(_bars(plain(stream, STREAM_NAME), own, _assignment_text, log.arms, unit_s, look))
     outcomes = {a.outcome for a in assignments}
@@ -259,11 +252,6 @@ def _work_bars(log: ShiftLog, unit_s: float) -> list[Trace]:
 def _legend_entry(name: str, look: Trace) -> Trace:
     """A grey bar in the legend alone."""
     return BAR | {"name": name, "x": [None], "y": [None], "marker": {"color": "#888888"} | look}
-
-
-def _shape(a: JobSpan) -> str:
-    """Pattern of a bar, for people who see no colours and for dark pages, which show no dark outline."""
-    return "/" if a.outcome == "returned" else "." if a.late_s else ""
 
 
 def _bars(
@@ -323,8 +311,8 @@ def _lanes(telemetry: Telemetry, arms: int) -> list[int]:
     return np.argsort(-peak_c, kind="stable")[:HOTTEST].tolist()
 
 
-def _heat_map(log: ShiftLog, axis: int, unit: str, unit_s: float) -> Trace:
-    """The hottest motor of each arm over time, one row per arm; y axis `axis`, x axis 3."""
+def _heat_map(log: ShiftLog, lane: int, unit: str, unit_s: float) -> Trace:
+    """The hottest motor of each arm over time, one row per arm; y axis `lane`, x axis 3."""
     telemetry, arms, warning_c, error_c = log.readings, log.arms, log.limits.warning_c, log.limits.error_c
     samples = len(telemetry.time_s)
     edges = np.unique(np.linspace(0, samples, min(samples, HEAT_BINS) + 1).astype(int))[:-1]
@@ -346,7 +334,7 @@ def _heat_map(log: ShiftLog, axis: int, unit: str, unit_s: float) -> Trace:
         "x": _packed(telemetry.time_s[edges] / unit_s),
         "y": list(range(len(arms))),
         "xaxis": "x3",
-        "yaxis": f"y{axis}",
+        "yaxis": f"y{lane}",
         "zmin": 0,
         "zmax": 2 * (high - low),
         "colorscale": [[float(share), colour] for share, colour in zip(shares, HEAT, strict=True)],
@@ -398,7 +386,7 @@ def _blocks(arms: Sequence[str], lanes: Sequence[int], legend_px: float) -> dict
         "fixedrange": True,
         "automargin": True,
     }
-    heat: dict[str, Any] = {}
+    heat: Trace = {}
     if overview:
         rows["tickfont"] = {"size": 8}
         place = {"domain": [paper(map_top + map_px), paper(map_top)], "anchor": "x3", "range": [len(arms) - 0.5, -0.5]}
@@ -464,22 +452,11 @@ def _temperatures(
         for j, (colour, dash) in enumerate(JOINT_LINES):
             value, name = telemetry.temp_c[:, a, j], f"joint {j + 1}"
             kept = decimate(value, points)
-            traces.append(
-                {
-                    "type": "scatter",
-                    "mode": "lines",
-                    "name": name,
-                    "legendgroup": name,
-                    "legend": "legend2",
-                    "showlegend": lane == 0,
-                    "x": _packed(telemetry.time_s[kept] / unit_s),
-                    "y": _packed(value[kept]),
-                    "xaxis": "x2",
-                    "yaxis": f"y{lane + 2}",
-                    "line": {"color": colour, "width": 1.5, "dash": dash},
-                    "hovertemplate": f"{plain(arm)} {name}<br>%{{y:.1f}} °C at %{{x:.2f}} {unit}<extra></extra>",
-                }
-            )
+            hover = f"{plain(arm)} {name}<br>%{{y:.1f}} °C at %{{x:.2f}} {unit}<extra></extra>"
+            line = {"color": colour, "width": 1.5, "dash": dash}
+            place = {"legendgroup": name, "legend": "legend2", "showlegend": lane == 0}
+            place |= {"xaxis": "x2", "yaxis": f"y{lane + 2}"}
+            traces.append(_curve(name, telemetry.time_s[kept] / unit_s, value[kept], line, hover) | place)
     return traces
 
 

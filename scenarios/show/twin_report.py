@@ -5,8 +5,7 @@ difficulty, error by epochs, generated motion. RMS torque and an untrained netwo
 twin.
 """
 
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
@@ -20,7 +19,7 @@ from sklearn.metrics import roc_auc_score
 
 from fleet.arm.random_motions import random_jobs
 from fleet.errors import FleetError
-from fleet.motion import CHANNELS, RATE_HZ, Plan
+from fleet.motion import CHANNELS, RATE_HZ
 from scenarios.prepare.arms import plan_arms
 from scenarios.prepare.twins import (
     LOG_INPUT,
@@ -34,8 +33,8 @@ from scenarios.prepare.twins import (
 )
 from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
-from scenarios.result_folder import ResultKind
-from scenarios.show.page import AXIS, LAYOUT, Chart, Page, Section
+from scenarios.result_folder import ResultKind, json_text
+from scenarios.show.page import AXIS, LAYOUT, Chart, Section, sections_page
 from scenarios.spec.jobs import rehearsal_works
 from scenarios.spec.schema import Scenario
 from scenarios.table import Table
@@ -55,8 +54,7 @@ Cells = dict[tuple[int, int], list[dict[str, Any]]]
 CARD, PAGE = "report.json", "report.html"
 REPORT = ResultKind(name="twin report", card=CARD, files=(CARD, PAGE))
 CHANNEL_NAMES = ("position", "velocity", "torque")
-ERROR_HEADS = ("position, rad", "velocity, rad/s", "torque, N·m")
-CHANNEL_LABELS = ("q (rad)", "dq/dt (rad/s)", "τ (N·m)")
+CHANNEL_HEADS = ("position, rad", "velocity, rad/s", "torque, N·m")
 BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#8a8a8a"
 """Cool or the twin, hot, untrained, other; of Okabe and Ito, for colour-blind readers."""
 LEAST_ERROR = 1e-6
@@ -76,6 +74,11 @@ LOG_TRAIN_SHARE = 0.6
 """Share of the cool files that train the twin of logs."""
 LOG_CONFIG = TwinConfig(record_hz=2.0, epochs=40, restarts=1).changed(**LOG_INPUT)
 """Windows of 25 s at the sampling rate of the logs."""
+LIMITS = (
+    "d uses motion and torque alone. It ignores the temperatures at the start and the duration of a job; a thermal "
+    "network uses both. A high d means new motion or more load than usual, and only load heats.",
+    "Simulated temperatures are those of a thermal network whose absolute scale is known to ± 25 %.",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,10 +103,8 @@ SIZE = Size()
 
 @dataclass(frozen=True, eq=False)
 class Made:
-    """Motions that one network generated at one strength, and their sources."""
+    """Motions that a network generated at one strength, and their sources."""
 
-    network: str
-    strength: float
     pairs: tuple[tuple[Array, Array], ...]
     """Source and motion, q, qd, tau, [time, 3, joint] each."""
     rate_hz: float
@@ -153,8 +154,8 @@ class Subject:
     """Profiles of the phases of cool test items, [time, 3, joint] at `twin.config.record_hz`, for the epoch table."""
     epoch_records: int
     """Number of them that its networks learn: few, so that more epochs still help."""
-    make: Callable[[str, Twin, float, int], Made]
-    """Generate motions: name of the network, network, strength, number."""
+    make: Callable[[Twin, float, int], Made]
+    """Generate motions: network, strength, number."""
 
     @cached_property
     def examples(self) -> tuple[int, int]:
@@ -173,6 +174,15 @@ class Subject:
         cool, hot = (int(group[typical(errors[group])]) for group in groups)
         return cool, hot
 
+    @property
+    def networks(self) -> dict[str, Twin]:
+        """The twin and its baseline by name."""
+        return {"twin": self.twin, "untrained network": self.untrained}
+
+    def torque_auroc(self, windows: Array, hot: Array) -> float:
+        """How well the RMS torque of windows [window, time, joint, channel] tells the hot ones [window]."""
+        return auroc(hot, np.square(windows[:, :, self.joint, TAU], dtype=float).mean(axis=1))
+
     def scores(self) -> dict[str, Array]:
         """Scores of the items, higher for harder ones, each [item]; the first is that of the paper for one joint."""
         j, of = self.joint, f"joint {self.joint + 1}"
@@ -180,7 +190,7 @@ class Subject:
             f"d of {of}": self.features.errors[:, j].sum(axis=-1),
             "d, weighted": self.features.difficulty @ self.twin.joint_weight,
             "Σ d (paper)": self.features.difficulty.sum(axis=1),
-            f"RMS torque of {of}": np.sqrt(self.features.torque_sq[:, j]),
+            f"RMS torque of {of}": self.features.torque_sq[:, j],
             f"d of {of}, untrained network": self.untrained_features.errors[:, j].sum(axis=-1),
         }
 
@@ -238,50 +248,47 @@ def scenario_subjects(
     warning_c, hottest_c = scenario.limits.warning_c, peak_c.max(axis=1)
     kind = np.where(hottest_c <= spec.cool_c, COOL, np.where(hottest_c < warning_c, BETWEEN, HOT))
     repetitions = [max(1, int(np.ceil(spec.horizon_s / plan.cycle.duration_s))) for plan in plans]
-    shown = np.flatnonzero(kind != BETWEEN)
-    profiles = [np.concatenate([phase.profile for phase in plan.phases]) for plan in plans]
+    shown = [plans[i] for i in np.flatnonzero(kind != BETWEEN)]
+    shown_hot, once = kind[kind != BETWEEN] == HOT, [1] * len(shown)
+    profiles = [np.concatenate([phase.profile for phase in plan.phases]) for plan in shown]
+    works = [(plan.work, plan.work.places[0].name.partition("/")[0]) for plan in shown]
+    names = [f"{place} ({work.kind}, {work.payload_kg:.1f} kg)" for work, place in works]
     trained_on = [*records(own), *exploration_records(scenario, planned)]
     verification = Verification.nominal(robot, spec.ambient_c, cool_c=spec.cool_c, horizon_s=spec.horizon_s)
 
-    def make(name: str, twin: Twin, strength: float, count: int) -> Made:
+    def make(twin: Twin, strength: float, count: int) -> Made:
         how = {"s": strength, "count": count, "verification": verification, "fixtures": scenario.fixtures}
         try:
             made = generate(twin, bare_arm(robot, motors, thermal), own, **how)
         except GenerationError:
-            return Made(name, strength, (), RATE_HZ, float("nan"), "none passed")
+            return Made((), RATE_HZ, float("nan"), "none passed")
         pairs = tuple((m.source.cycle.profile, m.plan.cycle.profile) for m in made.motions)
         distance_rad = float(np.mean([m.distance_rad for m in made.motions]))
-        passed = f"{len(pairs)} of {made.draws} passed"
-        return Made(name, strength, pairs, RATE_HZ, distance_rad, passed, made.truly_cool)
+        return Made(pairs, RATE_HZ, distance_rad, f"{len(pairs)} of {made.draws} passed", made.truly_cool)
 
     subjects = []
     for k in seeds:
         seed = training_seed(scenario, k)
         (twin,) = train_twins(scenario, [planned], folder, progress, seed=None if k == 0 else seed)
         untrained = _untrained(trained_on, twin.config, seed, robot.name, folder)
-        joint = int(np.argmax(twin.joint_weight))
-        cut_up = cut_jobs([plans[i] for i in shown], [1] * len(shown), twin.config)
-        few = _few(kind[shown][cut_up.job] == HOT, size.windows)
+        cut_up = cut_jobs(shown, once, twin.config)
+        few = _few(shown_hot[cut_up.job], size.windows)
         subjects.append(
             Subject(
-                twin=twin, untrained=untrained, joint=joint, item="job",
+                twin=twin, untrained=untrained, joint=int(np.argmax(twin.joint_weight)), item="job",
                 kinds=(f"cool, to {spec.cool_c:g} °C", "between", f"hot, from {warning_c:g} °C"),
                 how=f"{len(plans)} random jobs, on none of which the twin was trained. The kind of a job is that of "
                 f"its hottest motor when it repeats for {spec.horizon_s / 60:g} min, by the true heat of the arm.",
                 trained_on=trained_on, kind=kind, features=twin.features(plans, repetitions),
                 untrained_features=untrained.features(plans, repetitions), windows=cut_up.windows[few],
-                window_hot=kind[shown][cut_up.job[few]] == HOT, names=[_job_name(plans[i]) for i in shown],
-                recorded_hot=kind[shown] == HOT, recorded=twin.features([plans[i] for i in shown], [1] * len(shown)),
-                motion=lambda i, rate_hz=twin.config.rate_hz: resample(profiles[shown[i]], RATE_HZ, rate_hz),
+                window_hot=shown_hot[cut_up.job[few]], names=names,
+                recorded_hot=shown_hot, recorded=twin.features(shown, once),
+                motion=lambda i, rate_hz=twin.config.rate_hz: resample(profiles[i], RATE_HZ, rate_hz),
                 cool_jobs=[records([plans[i]]) for i in np.flatnonzero(kind == COOL)],
                 epoch_records=5, make=make,
             )
         )  # fmt: skip
     return subjects
-
-
-def _job_name(plan: Plan) -> str:
-    return f"{plan.work.places[0].name.partition('/')[0]} ({plan.work.kind}, {plan.work.payload_kg:.1f} kg)"
 
 
 def _untrained(trained_on: Sequence[Array], config: TwinConfig, seed: int, arm: str, folder: Path) -> Twin:
@@ -295,25 +302,14 @@ def _few(hot: Array, most: int) -> Array:
     return np.sort(np.concatenate(list(chosen)))
 
 
-def log_subjects(
-    recordings: Sequence[Recording], seeds: Sequence[int], size: Size, folder: Path, progress: Progress = quiet
-) -> list[Subject]:
-    """Twins trained on cool logs of an arm, each seed with its own choice of files, judged on all other files.
+def log_subject(
+    recordings: Sequence[Recording], seed: int, *, size: Size, folder: Path, config: TwinConfig | None = None
+) -> Subject:
+    """A twin trained on cool logs of an arm, chosen by the seed, and judged on all other files.
 
     Raises:
         FleetError: a log has no temperatures, or too few are cool.
     """
-    subjects = []
-    for done, seed in enumerate(seeds):
-        progress("training", Count(done, len(seeds)))
-        subjects.append(log_subject(recordings, seed, size=size, folder=folder))
-    return subjects
-
-
-def log_subject(
-    recordings: Sequence[Recording], seed: int, *, size: Size, folder: Path, config: TwinConfig | None = None
-) -> Subject:
-    """The subject of one seed; see `log_subjects`."""
     config, joint = config or LOG_CONFIG, LOADED_JOINT
     names = training_files(recordings, seed)
     training, test = ([r for r in recordings if (r.name in names) == wanted] for wanted in (True, False))
@@ -329,17 +325,15 @@ def log_subject(
             windows.append(cut(stretch.profile, config.window, config.stride).astype(np.float32))
             temps += [stretch.temp_c[a : a + config.window, joint].mean() for a in first]
             owners += [r.name] * len(first)
+    length = f"{config.window / config.rate_hz:g} s"
     if not windows:
-        raise FleetError(
-            f"None of the {len(test)} test logs lasts {config.window / config.rate_hz:g} s; add longer logs."
-        )
-    every, temp_c, owner = np.concatenate(windows), np.array(temps), np.array(owners)
-    hot, long = temp_c >= LOG_HOT_C, [r for r in test if r.name in set(owners)]
-    few = _few(hot, size.windows)
+        raise FleetError(f"None of the {len(test)} test logs lasts {length}; add longer logs.")
+    every, hot, owner = np.concatenate(windows), np.array(temps) >= LOG_HOT_C, np.array(owners)
+    long, few = [r for r in test if r.name in set(owners)], _few(hot, size.windows)
     cool = [[w.transpose(0, 2, 1)] for r in long for w in every[(owner == r.name) & ~hot][:40:4]]
     own = draw_windows(windows_of(trained_on, config), size.windows, np.random.SeedSequence(seed))
 
-    def make(name: str, network: Twin, strength: float, count: int) -> Made:
+    def make(network: Twin, strength: float, count: int) -> Made:
         rng = np.random.default_rng(seed)
         source = own[np.sort(rng.choice(len(own), min(count, len(own)), replace=False))]
         mu, sigma = network.posterior(source)
@@ -347,7 +341,7 @@ def log_subject(
         near = network.scaler.to_si(network.scaler.to_z(source))
         apart = np.sqrt(np.square(decoded - near)[..., 0].mean(axis=(1, 2)))
         pairs = tuple((a.transpose(0, 2, 1), b.transpose(0, 2, 1)) for a, b in zip(near, decoded, strict=True))
-        return Made(name, strength, pairs, config.rate_hz, float(apart.mean()), f"{len(pairs)} windows, not verified")
+        return Made(pairs, config.rate_hz, float(apart.mean()), f"{len(pairs)} windows, not verified")
 
     def motion(i: int) -> Array:
         return max((stretch.profile for stretch in stretches(long[i], config.rate_hz)), key=len)
@@ -357,8 +351,8 @@ def log_subject(
         twin=twin, untrained=untrained, joint=joint, item="window",
         kinds=(f"cool, below {LOG_HOT_C:g} °C", "between", f"hot, from {LOG_HOT_C:g} °C"),
         how=f"{len(training)} of {len(recordings)} files, which never reach {LOG_HOT_C:g} °C on joint {joint + 1}, "
-        f"train the twin; the other {len(test)} are tested, {len(hot)} windows of {config.window / config.rate_hz:g} s "
-        f"of which {hot.sum()} are hot.",
+        f"train the twin; the other {len(test)} are tested, {len(hot)} windows of {length} of which {hot.sum()} are "
+        "hot.",
         trained_on=trained_on, kind=np.where(hot, HOT, COOL), features=twin.window_features(every),
         untrained_features=untrained.window_features(every), windows=every[few], window_hot=hot[few],
         names=[r.name for r in long],
@@ -434,8 +428,7 @@ def _cell(
     jobs: Sequence[Sequence[Array]], tested: Array, config: TwinConfig, epochs: int, seed: int, records: int
 ) -> tuple[Array, Array]:
     """Errors [trained on/held out, joint, channel] and [window, joint]."""
-    rng = np.random.default_rng(np.random.SeedSequence([seed, 1]))
-    chosen = rng.permutation(len(jobs))
+    chosen = np.random.default_rng(np.random.SeedSequence([seed, 1])).permutation(len(jobs))
     record, others = (
         [phase for i in some for phase in jobs[i] if len(phase)]
         for some in (chosen[:records], chosen[records : 5 * records])
@@ -457,30 +450,30 @@ def data_chapter(subjects: Sequence[Subject], size: Size) -> Section:
     parts = [resample(each, config.record_hz, config.rate_hz)[:, :, s.joint] for each in s.trained_on]
     seen = s.motion(hot)[:, :, s.joint]
     train = np.concatenate([piece for part in parts if len(part) for piece in (part, gap)])[: len(seen)]
-    load = [np.sqrt(np.square(np.concatenate(s.trained_on)[:, TAU], dtype=float).mean(axis=0))]
-    load += [np.sqrt(s.features.torque_sq[s.kind == kind].mean(axis=0)) for kind in (COOL, HOT)]
+    load = {"training data": np.square(np.concatenate(s.trained_on)[:, TAU], dtype=float)}
+    load |= {f"{name} {s.item}s": s.features.torque_sq[s.kind == kind] for name, kind in (("cool", COOL), ("hot", HOT))}
+    rms = {name: np.sqrt(squares.mean(axis=0)) for name, squares in load.items()}
     cells: Cells = {}
     for c in range(3):
         cells[c, 0] = [_line(train[:, c], config.rate_hz, "training data", BLUE)]
         cells[c, 1] = [_line(seen[:, c], config.rate_hz, "hot recording", ORANGE)]
-    ratio = load[2][s.joint] / load[0][s.joint]
-    names = ("training data", f"cool {s.item}s", f"hot {s.item}s")
-    rows = [(name, *(f"{v:.2f}" for v in row)) for name, row in zip(names, load, strict=True)]
+    ratio = rms[f"hot {s.item}s"][s.joint] / rms["training data"][s.joint]
+    rows = tuple(_row(name, values, ".2f") for name, values in rms.items())
     return Section(
         sentences=(f"RMS torque of joint {s.joint + 1}: {ratio:.1f} times as large in hot {s.item}s as in training.",),
         how=f"{s.how} Left: joint {s.joint + 1} in the first of {len(s.trained_on)} training records, one after "
         f"another. Right: {s.names[hot]}, a typical hot recording (see Reconstruction).",
-        charts=_charts("data", cells, x="time (s)", y=CHANNEL_LABELS, heads=("training data", "hot"), shared=True),
-        tables=(Table(head=("RMS torque, N·m", *_joints(len(load[0]))), rows=tuple(rows)),),
-        numbers={"rms_torque_nm": load, "records": len(s.trained_on)},
-    )  # fmt: skip
+        charts=_over_time("data", cells, ("training data", "hot")),
+        tables=(Table(head=("RMS torque, N·m", *_joints(s)), rows=rows),),
+        numbers={"rms_torque_nm": list(rms.values()), "records": len(s.trained_on)},
+    )
 
 
 def latent_chapter(subjects: Sequence[Subject], size: Size) -> Section:
     """The latent plane of the joint, of the twin and of the untrained network."""
     s, cells, values = subjects[0], Cells(), dict[str, float]()
     known = windows_of(s.trained_on, s.twin.config)
-    for column, (name, twin) in enumerate((("twin", s.twin), ("untrained network", s.untrained))):
+    for column, (name, twin) in enumerate(s.networks.items()):
         mu = twin.posterior(s.windows)[0][:, min(s.joint, len(twin.nets) - 1)]
         features = twin.window_features(known)
         distance = Calibration(features, np.zeros(len(known), int)).latent(twin.window_features(s.windows))
@@ -490,9 +483,8 @@ def latent_chapter(subjects: Sequence[Subject], size: Size) -> Section:
             | {"marker": {"color": colour, "size": 4, "opacity": 0.6}}
             for kind, label, colour in ((~s.window_hot, s.kinds[COOL], BLUE), (s.window_hot, s.kinds[HOT], ORANGE))
         ]
-    values["RMS torque"] = auroc(s.window_hot, np.square(s.windows[:, :, s.joint, TAU], dtype=float).mean(axis=1))
+    values["RMS torque"] = s.torque_auroc(s.windows, s.window_hot)
     first, other, torque = values.values()
-    rows = tuple((name, f"{value:.3f}") for name, value in values.items())
     return Section(
         sentences=(
             f"The distance from the training cluster tells hot from cool windows with AUROC {first:.2f}; in the latent "
@@ -500,10 +492,15 @@ def latent_chapter(subjects: Sequence[Subject], size: Size) -> Section:
         ),
         how=f"Posterior means of {len(s.windows)} test windows under the network of joint {s.joint + 1}. The distance "
         "is that of Mahalanobis from the means of the training windows.",
-        charts=_charts("latent", cells, x="μ₁", y=("μ₂",), heads=("twin", "untrained network"), height=420),
-        tables=(Table(head=("hot against cool windows", "AUROC"), rows=rows),),
+        charts=_charts("latent", cells, x="μ₁", y=("μ₂",), heads=tuple(s.networks), height=420),
+        tables=(
+            Table(
+                head=("hot against cool windows", "AUROC"),
+                rows=tuple((name, f"{value:.3f}") for name, value in values.items()),
+            ),
+        ),
         numbers={"auroc": values},
-    )  # fmt: skip
+    )
 
 
 def reconstruction_chapter(subjects: Sequence[Subject], size: Size) -> Section:
@@ -518,76 +515,72 @@ def reconstruction_chapter(subjects: Sequence[Subject], size: Size) -> Section:
                 _line(made[name][1][:, c, s.joint], rate_hz, f"reconstructed, {name}", colour, dash)
                 for name, colour, dash in (("untrained", GREEN, "dot"), ("twin", BLUE, "solid"))
             ]
-        for name, (recorded, again) in made.items():
-            errors[f"{kind}, {name}"] = np.abs(recorded - again)[:, :, s.joint].mean(axis=0)
+        own, other = (np.abs(recorded - again)[:, :, s.joint].mean(axis=0) for recorded, again in made.values())
+        errors |= {f"{kind}, twin": own, f"{kind}, untrained": other}
+        usual = np.median(s.recorded.errors[s.recorded_hot == bool(column), s.joint], axis=0)
         torque = float(np.sqrt(np.square(motion[:, TAU, s.joint]).mean()))
-        typical_of = np.median(s.recorded.errors[s.recorded_hot == bool(column), s.joint], axis=0)
-        rows.append((f"{kind}: {s.names[i]}", *(f"{e:.3g}" for e in errors[f"{kind}, twin"]), f"{torque:.1f}"))
-        rows.append(("the same, untrained network", *(f"{e:.3g}" for e in errors[f"{kind}, untrained"]), ""))
-        rows.append((f"median of all {kind} ones", *(f"{e:.3g}" for e in typical_of * s.twin.scaler.std[s.joint]), ""))
+        rows.append((*_row(f"{kind}: {s.names[i]}", own, ".3g"), f"{torque:.1f}"))
+        rows.append((*_row("the same, untrained network", other, ".3g"), ""))
+        rows.append((*_row(f"median of all {kind} ones", usual * s.twin.scaler.std[s.joint], ".3g"), ""))
     cool, hot = (errors[f"{kind}, twin"][TAU] for kind in ("cool", "hot"))
     return Section(
         sentences=(f"Mean error of the torque of joint {s.joint + 1}: {cool:.2f} N·m cool, {hot:.2f} N·m hot.",),
         how="Decoded from the posterior mean, window by window without overlap. Each example is the recording whose "
         "errors are nearest the median of its kind in all three channels.",
-        charts=_charts("reconstruction", cells, x="time (s)", y=CHANNEL_LABELS, heads=("cool", "hot"), shared=True),
-        tables=(Table(head=("mean |error|", *ERROR_HEADS, "RMS torque, N·m"), rows=tuple(rows)),),
+        charts=_over_time("reconstruction", cells, ("cool", "hot")),
+        tables=(Table(head=("mean |error|", *CHANNEL_HEADS, "RMS torque, N·m"), rows=tuple(rows)),),
         numbers={"mean_error_si": errors, "examples": [s.names[i] for i in s.examples]},
-    )  # fmt: skip
+    )
 
 
 def reconstruct(twin: Twin, motion: Array) -> tuple[Array, Array]:
     """Motion [time, 3, joint] near the training data in whole turns, and its reconstruction, both [time, 3, joint]."""
     window = twin.config.window
     windows, first = cut(motion, window, window), starts(len(motion), window, window)
-    result = []
-    for values in (twin.scaler.to_si(twin.scaler.to_z(windows)), twin.reconstruct(windows)):
-        whole = np.zeros((max(len(motion), window), *motion.shape[1:]))
+    result = np.zeros((2, max(len(motion), window), *motion.shape[1:]))
+    for whole, values in zip(
+        result, (twin.scaler.to_si(twin.scaler.to_z(windows)), twin.reconstruct(windows)), strict=True
+    ):
         for start, samples in zip(first, values.transpose(0, 1, 3, 2), strict=True):
             whole[start : start + window] = samples
-        result.append(whole[: len(motion)])
-    return result[0], result[1]
+    return result[0, : len(motion)], result[1, : len(motion)]
 
 
 def difficulty_chapter(subjects: Sequence[Subject], size: Size) -> Section:
     """Difficulty of cool and hot items, and how well it tells them apart, for each seed."""
     s = subjects[0]
-    d, cells, rows = s.features.difficulty, Cells(), list[tuple[str, ...]]()
-    total = d @ s.twin.joint_weight
+    d, cells, rows = s.features.difficulty, Cells({(0, 0): []}), list[tuple[str, ...]]()
+
+    def with_total(each: Array) -> Array:
+        """d of the joints and of the arm, [..., joint + 1]."""
+        return np.append(each, (each @ s.twin.joint_weight)[..., None], axis=-1)
+
     for kind, colour in ((COOL, BLUE), (BETWEEN, GREY), (HOT, ORANGE)):
         chosen = s.kind == kind
         if chosen.any():
             name = f"{s.kinds[kind]} ({chosen.sum()} {s.item}s)"
-            quantiles = {n: np.percentile(d[chosen], q, axis=0) for n, q in QUANTILES.items()}
-            cells.setdefault((0, 0), []).append(
-                {"type": "box", "x": _joints(d.shape[1]), "name": name, "marker": {"color": colour}}
-                | {n: _plain(v) for n, v in quantiles.items()}
-            )
-            medians = (*np.median(d[chosen], axis=0), np.median(total[chosen]))
-            rows.append((f"median, {name}", *(f"{v:.3f}" for v in medians)))
+            quantiles = {n: _plain(np.percentile(d[chosen], q, axis=0)) for n, q in QUANTILES.items()}
+            cells[0, 0].append({"type": "box", "x": _joints(s), "name": name, "marker": {"color": colour}} | quantiles)
+            rows.append(_row(f"median, {name}", np.median(with_total(d[chosen]), axis=0), ".3f"))
     for name, i in zip(("cool", "hot"), s.examples, strict=True):
-        own = s.recorded.difficulty[i]
-        rows.append((f"the {name} example", *(f"{v:.3f}" for v in (*own, own @ s.twin.joint_weight))))
+        rows.append(_row(f"the {name} example", with_total(s.recorded.difficulty[i]), ".3f"))
     ranks = [{name: auroc(each.kind == HOT, v) for name, v in each.scores().items()} for each in subjects]
     by_name = {name: [rank[name] for rank in ranks] for name in ranks[0]}
-    first, *_, torque, other = by_name
+    first, *_, torque, other = map(spread, by_name.values())
+    against = f"ot against all other {s.item}s"
     return Section(
         sentences=(
-            f"Hot against all other {s.item}s: {first} has AUROC {spread(by_name[first])}, RMS torque "
-            f"{spread(by_name[torque])}, the untrained network {spread(by_name[other])}.",
+            f"H{against}: {next(iter(by_name))} has AUROC {first}, RMS torque {torque}, the untrained network {other}.",
         ),
         how="d_k = 1 − exp(−e_k), e_k the mean absolute error of joint k summed over the channels; d is their sum with "
         f"the weights of the twin. {len(subjects)} seeds, mean ± standard deviation; figure: the first.",
         charts=_charts("difficulty", cells, x="", y=("d of the joint",), heads=("",), height=420),
         tables=(
-            Table(head=("", *_joints(d.shape[1]), "d"), rows=tuple(rows)),
-            Table(
-                head=(f"hot against all other {s.item}s", "AUROC"),
-                rows=tuple((name, spread(values)) for name, values in by_name.items()),
-            ),
+            Table(head=("", *_joints(s), "d"), rows=tuple(rows)),
+            Table(head=(f"h{against}", "AUROC"), rows=tuple((name, spread(each)) for name, each in by_name.items())),
         ),
         numbers={"auroc": by_name},
-    )  # fmt: skip
+    )
 
 
 def epochs_chapter(subjects: Sequence[Subject], size: Size) -> Section:
@@ -601,23 +594,18 @@ def epochs_chapter(subjects: Sequence[Subject], size: Size) -> Section:
     errors, tested = epoch_study(jobs, windows[:, :, upto], config=s.twin.config, **how)
     of_joint: dict[str, Array] = dict(zip(("trained on", "held out"), errors[:, :, :, s.joint], strict=True))
     ranks = np.array([[auroc(hot, each[:, s.joint]) for each in row] for row in tested])
-    torque = auroc(hot, np.square(windows[:, :, s.joint, TAU], dtype=float).mean(axis=1))
-    x, cells = [f"{n}" if n else "untrained" for n in size.epochs], Cells()
-    for c in range(3):
-        cells[0, c] = [
-            _over_epochs(x, values[:, :, c], kind, colour)
-            for (kind, values), colour in zip(of_joint.items(), (BLUE, GREY), strict=True)
-        ]
+    torque = s.torque_auroc(windows, hot)
+    x, cells, rows = [f"{n}" if n else "untrained" for n in size.epochs], Cells(), list[tuple[str, ...]]()
+    for c, channel in enumerate(CHANNEL_NAMES):
+        cells[0, c] = []
+        for (kind, values), colour in zip(of_joint.items(), (BLUE, GREY), strict=True):
+            cells[0, c].append(_over_epochs(x, values[:, :, c], kind, colour))
+            rows.append((f"{channel}, {kind}", *(spread(seeds_of, 2) for seeds_of in values[:, :, c].T)))
     cells[0, 3] = [_over_epochs(x, ranks, "error of the test windows", ORANGE)]
     cells[0, 3].append(_over_epochs(x, np.full((1, len(x)), torque), "RMS torque", GREEN))
     left = of_joint["held out"][:, -1].mean(axis=0) / of_joint["held out"][:, 0].mean(axis=0)
-    rows = [
-        (f"{name}, {kind}", *(spread(seeds_of, 2) for seeds_of in values[:, :, c].T))
-        for c, name in enumerate(CHANNEL_NAMES)
-        for kind, values in of_joint.items()
-    ]
-    rows += [("AUROC, hot test windows", *(spread(v, 2) for v in ranks.T))]
-    rows += [("the same by RMS torque", *(f"{torque:.2f}" for _ in x))]
+    rows.append(("AUROC, hot test windows", *(spread(v, 2) for v in ranks.T)))
+    rows.append(_row("the same by RMS torque", [torque] * len(x), ".2f"))
     shares = ", ".join(f"{share:.0%} for {name}" for name, share in zip(CHANNEL_NAMES, left, strict=True))
     return Section(
         sentences=(
@@ -631,30 +619,33 @@ def epochs_chapter(subjects: Sequence[Subject], size: Size) -> Section:
         charts=_charts("epochs", cells, x="epochs", y=("mean |error| (σ)",), heads=(*CHANNEL_NAMES, "AUROC, hot")),
         tables=(Table(head=("mean |error|, σ", *x), rows=tuple(rows)),),
         numbers={"epochs": size.epochs, **of_joint, "auroc": ranks, "auroc_rms_torque": torque},
-    )  # fmt: skip
+    )
 
 
 def generation_chapter(subjects: Sequence[Subject], size: Size) -> Section:
     """Motion that the twin generates near its training data."""
-    s, cells = subjects[0], {(row, column): [] for row in range(2) for column in range(2)}
-    networks = (("twin", s.twin, size.strengths), ("untrained network", s.untrained, size.strengths[1:2]))
-    made = [s.make(name, twin, strength, size.generated) for name, twin, all_of in networks for strength in all_of]
-    rows = []
-    for each in made:
-        load = (np.sqrt(np.mean([np.square(pair[k][:, TAU, s.joint]).mean() for pair in each.pairs])) for k in (0, 1))
-        numbers = (f"{each.distance_rad:.3f}", *(f"{v:.1f}" for v in load)) if each.pairs else ("–", "–", "–")
-        cool = "–" if each.cool_share is None else f"{each.cool_share:.0%}"
-        rows.append((f"{each.network}, s = {each.strength:g}", each.outcome, *numbers, cool))
-        column = int(each.network != "twin")
-        for source, motion in each.pairs[:1] if each.strength == size.strengths[1] else ():
-            for row, c in enumerate((0, TAU)):
-                cells[row, column] = [
-                    _line(motion[:, c, s.joint], each.rate_hz, "generated", GREEN if column else BLUE),
-                    _line(source[:, c, s.joint], each.rate_hz, "source", GREY, "dot"),
-                ]
-    ours = [each for each in made if each.network == "twin"]
-    far = ", ".join(f"{each.distance_rad:.2f} rad at s = {each.strength:g}" for each in ours)
-    known = [each.cool_share for each in ours if each.cool_share is not None]
+    s, rows, numbers = subjects[0], list[tuple[str, ...]](), list[dict[str, Any]]()
+    cells: Cells = {(row, column): [] for row in range(2) for column in range(2)}
+    strengths = {"twin": size.strengths, "untrained network": size.strengths[1:2]}
+    for column, (name, network) in enumerate(s.networks.items()):
+        for strength in strengths[name]:
+            made = s.make(network, strength, size.generated)
+            load = (
+                np.sqrt(np.mean([np.square(pair[k][:, TAU, s.joint]).mean() for pair in made.pairs])) for k in (0, 1)
+            )
+            figures = (f"{made.distance_rad:.3f}", *(f"{v:.1f}" for v in load)) if made.pairs else ("–", "–", "–")
+            cool = "–" if made.cool_share is None else f"{made.cool_share:.0%}"
+            rows.append((f"{name}, s = {strength:g}", made.outcome, *figures, cool))
+            numbers.append({"network": name, "strength": strength, **vars(made), "pairs": len(made.pairs)})
+            for source, motion in made.pairs[:1] if strength == size.strengths[1] else ():
+                for row, c in enumerate((0, TAU)):
+                    cells[row, column] = [
+                        _line(motion[:, c, s.joint], made.rate_hz, "generated", GREEN if column else BLUE),
+                        _line(source[:, c, s.joint], made.rate_hz, "source", GREY, "dot"),
+                    ]
+    ours = [each for each in numbers if each["network"] == "twin"]
+    far = ", ".join(f"{each['distance_rad']:.2f} rad at s = {each['strength']:g}" for each in ours)
+    known = [each["cool_share"] for each in ours if each["cool_share"] is not None]
     sentences = [f"RMS distance of the positions from the source: {far}."]
     how = "A log has no model of its arm: position and torque are shown as decoded, and nothing is verified."
     if known:
@@ -668,24 +659,26 @@ def generation_chapter(subjects: Sequence[Subject], size: Size) -> Section:
         sentences=tuple(sentences),
         how=f"Latents of cool motion are perturbed, mu + s·eps·sigma, and decoded. {how} The figure shows the first "
         f"motion at s = {size.strengths[1]:g}.",
-        charts=_charts(
-            "generation", cells, x="time (s)", y=CHANNEL_LABELS[::2], heads=("twin", "untrained network"), shared=True
-        ),
+        charts=_over_time("generation", cells, tuple(s.networks), CHANNEL_HEADS[::2]),
         tables=(Table(head=head, rows=tuple(rows)),),
-        numbers={"made": [vars(each) | {"pairs": len(each.pairs)} for each in made]},
+        numbers={"made": numbers},
     )
 
 
-# Charts.
+# Rows of tables, and charts.
+
+
+def _row(name: str, values: Iterable[float], form: str) -> tuple[str, ...]:
+    return (name, *(format(value, form) for value in values))
+
+
+def _joints(subject: Subject) -> list[str]:
+    return [f"joint {j + 1}" for j in range(subject.twin.joints)]
 
 
 def _plain(values: Array) -> list[float | None]:
     """Numbers with four digits, as JSON allows them."""
     return [float(f"{v:.4g}") if np.isfinite(v) else None for v in np.asarray(values, dtype=float)]
-
-
-def _joints(count: int) -> list[str]:
-    return [f"joint {j + 1}" for j in range(count)]
 
 
 def _line(values: Array, rate_hz: float, name: str, colour: str, dash: str = "solid") -> dict[str, Any]:
@@ -701,6 +694,11 @@ def _over_epochs(x: Sequence[str], y: Array, name: str, colour: str) -> dict[str
     bars = {"type": "data", "array": _plain(y.std(axis=0, ddof=1)), "thickness": 1} if len(y) > 1 else None
     look = {"mode": "lines+markers", "line": {"color": colour}, "marker": {"size": 5}, "error_y": bars}
     return {"type": "scatter", "x": list(x), "y": _plain(y.mean(axis=0)), "name": name, **look}
+
+
+def _over_time(key: str, cells: Cells, heads: Sequence[str], y: Sequence[str] = CHANNEL_HEADS) -> tuple[Chart, ...]:
+    """Channels over time, a row each, with the same y axis in all columns."""
+    return _charts(key, cells, x="time, s", y=y, heads=heads, shared=True)
 
 
 def _charts(
@@ -746,20 +744,20 @@ def _charts(
 
 # The report.
 
-CHAPTERS: tuple[tuple[str, str, Callable[[Sequence[Subject], Size], Section]], ...] = (
-    ("data", "Training data", data_chapter),
-    ("latent", "Latent map", latent_chapter),
-    ("reconstruction", "Reconstruction of whole recordings", reconstruction_chapter),
-    ("difficulty", "Difficulty, cool and hot", difficulty_chapter),
-    ("epochs", "Error by epochs", epochs_chapter),
-    ("generation", "Generated motion", generation_chapter),
-)
+CHAPTERS: dict[str, tuple[str, Callable[[Sequence[Subject], Size], Section]]] = {
+    "data": ("Training data", data_chapter),
+    "latent": ("Latent map", latent_chapter),
+    "reconstruction": ("Reconstruction of whole recordings", reconstruction_chapter),
+    "difficulty": ("Difficulty, cool and hot", difficulty_chapter),
+    "epochs": ("Error by epochs", epochs_chapter),
+    "generation": ("Generated motion", generation_chapter),
+}
 
 
 def chapters_of(subjects: Sequence[Subject], size: Size, progress: Progress = quiet) -> list[Section]:
     """Every chapter; one that cannot be computed gives the reason."""
     chapters = []
-    for done, (key, title, compute) in enumerate(CHAPTERS):
+    for done, (key, (title, compute)) in enumerate(CHAPTERS.items()):
         progress("chapters", Count(done, len(CHAPTERS)))
         try:
             chapter = compute(subjects, size)
@@ -779,49 +777,18 @@ def origin_of(subjects: Sequence[Subject]) -> dict[str, str]:
     }
 
 
-def report_page(title: str, chapters: Sequence[Section], origin: Mapping[str, str]) -> str:
-    """The page as HTML text, which opens offline; the same input gives the same text."""
-    facts = Table(head=("", ""), rows=tuple(origin.items()), numbers=False)
-    failed = [each.title for each in chapters if each.failed]
-    content = {"lead": LIMITS, "sections": chapters, "failed": failed, "origin": facts}
-    charts = [chart for each in chapters for chart in each.charts]
-    return Page(title=title, template="sections.html", content=content, charts=charts, narrow=True).html()
+def write(chapters: Sequence[Section], origin: Mapping[str, str], folder: Path, title: str) -> dict[str, str]:
+    """Write page and numbers into an existing folder; returns the reasons of the chapters that failed, by key.
 
-
-LIMITS = (
-    "d uses motion and torque alone. It ignores the temperatures at the start and the duration of a job; a thermal "
-    "network uses both. A high d means new motion or more load than usual, and only load heats.",
-    "Simulated temperatures are those of a thermal network whose absolute scale is known to ± 25 %.",
-)
-
-
-def write(chapters: Sequence[Section], origin: Mapping[str, str], folder: Path, title: str) -> dict[str, Any]:  # JSON
-    """Write page and numbers into an existing folder; returns the content of report.json.
-
-    `status` is finished even where chapters failed; `failed` gives the reasons.
+    The `status` in report.json is finished even where chapters failed.
     """
-    (folder / PAGE).write_text(report_page(title, chapters, origin), encoding="utf-8")
-    card = {
-        "status": "finished",
-        "title": title,
-        "origin": dict(origin),
-        "failed": {each.key: each.failed for each in chapters if each.failed},
-        "chapters": {
-            each.key: {"title": each.title, "found": each.sentences, "how": each.how, "numbers": each.numbers}
-            | {"tables": [{"head": one.head, "rows": one.rows} for one in each.tables]}
-            for each in chapters
-        },
+    (folder / PAGE).write_text(sections_page(title, chapters, origin, LIMITS), encoding="utf-8")
+    failed = {each.key: each.failed for each in chapters if each.failed}
+    of_chapters = {
+        each.key: {"title": each.title, "found": each.sentences, "how": each.how, "numbers": each.numbers}
+        | {"tables": [{"head": one.head, "rows": one.rows} for one in each.tables]}
+        for each in chapters
     }
-    (folder / CARD).write_text(json.dumps(plain(card), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    return card
-
-
-def plain(value: Any) -> Any:  # JSON
-    """Plain JSON values: NaN becomes null, NumPy scalars and arrays become numbers and lists."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(inner) for inner in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+    card = {"status": "finished", "title": title, "origin": origin, "failed": failed, "chapters": of_chapters}
+    (folder / CARD).write_text(json_text(card), encoding="utf-8")
+    return failed

@@ -1,18 +1,38 @@
-"""A fleet as a table on the terminal, and as plain lines without a terminal."""
+"""`thermofleet bus watch`: a live fleet as a screen on the terminal, and as plain lines without a terminal."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from math import inf
+import math
+import os
+import select
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from typing import get_args
 
+import msgspec
 from rich.console import Group
+from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from fleet.bus.protocol.auction import ArmEvent, JobState
-from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetSnapshot, JobScore
+from fleet.bus.client import BusClient
+from fleet.bus.protocol.auction import SETTLED, ArmEvent, JobState, Result
+from fleet.bus.router import fleets_at
+from fleet.errors import NoRouter
+from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetListener, FleetSnapshot, JobScore, describe_status
 from fleet.live.space import ANYWHERE
+from scenarios.cli.options import the_fleet
 from scenarios.progress import brief
+from scenarios.show.words import clock
+from scenarios.signals import StopRequest, until_stopped
+from scenarios.terminal import echo, err_console, out_console, say
 
+WAIT_S, GONE_S = 0.5, 3.0
+"""Real seconds between two searches for a fleet, and without participants until a settled shift counts as ended."""
+OPEN: tuple[JobState, ...] = ("waiting", "awarded", "finishing")
+FRAME_S, LINE_S, SNAPSHOT_S = 0.25, 5.0, 1.0
+"""Real seconds between two frames, between two lines about an arm, and of listening for one snapshot."""
 HOT_K, WARM_K = 5.0, 10.0
 """Headroom below which an arm is shown in red, in yellow."""
 COOL_C = 20.0
@@ -44,6 +64,183 @@ PLAIN = {
     "break_end": "is back from a break",
 }
 """Events in words; others are shown by their kind."""
+
+
+def watch(
+    endpoint: str, fleet: str, *, as_json: bool = False, joints: bool = False, end_s: float | None = None
+) -> None:
+    """Show a fleet until its shift has ended, or Ctrl-C; or print one snapshot as JSON.
+
+    Args:
+        fleet: Its name; "" for the only one at the endpoint, and to wait for it.
+        joints: Show every joint.
+        end_s: End of the shift, s of fleet time, if it is known.
+
+    Raises:
+        FleetError: there is no such fleet, or there are several.
+    """
+    news: deque[str] = deque(maxlen=100)
+
+    def on_message(_: str, name: str, message: msgspec.Struct) -> None:
+        if line := describe(name, message):
+            news.append(line)
+
+    def on_presence(role: str, name: str, present: bool) -> None:
+        news.append(f"{name if role == 'arm' else f'auctioneer {name}'} {'joined' if present else 'left'}")
+
+    with until_stopped() as stop, ExitStack() as resources:
+        name = the_fleet(fleet, endpoint) if as_json or fleet else wait_for_fleet(endpoint, stop)
+        link = resources.enter_context(BusClient(endpoint, name, stopped=None if as_json else stop.is_set))
+        listener = FleetListener(link, on_message=on_message, on_presence=on_presence)
+        if as_json:
+            listener.serve(time.monotonic() + SNAPSHOT_S)
+            echo(msgspec.json.encode(listener.view.snapshot(time.monotonic())).decode())
+        else:
+            end = ShiftEnd()
+
+            def ended(fleet: FleetSnapshot) -> bool:
+                return stop.is_set() or bool(end.check(fleet, time.monotonic()))
+
+            if out_console.is_terminal:
+                draw(listener, news, ended, joints=joints, end_s=end_s)
+            else:
+                print_lines(listener, news, ended, joints=joints, end_s=end_s)
+            if end.sentence:
+                say(end.sentence, out_console)
+        stop.leave("Stopped watching.")
+
+
+def wait_for_fleet(endpoint: str, stop: StopRequest) -> str:
+    """Name of the only fleet at the router, once there is one.
+
+    Raises:
+        FleetError: there are several, or stopped meanwhile.
+    """
+    waits = False
+    while True:
+        try:
+            fleets = fleets_at(endpoint, timeout_s=1.0)
+        except NoRouter:
+            fleets = ()
+        if len(fleets) == 1:
+            return fleets[0]
+        if fleets:
+            return the_fleet("", endpoint)
+        if not waits:
+            say(f"Waiting for a fleet at {endpoint} …", err_console)
+        waits = True
+        if stop.wait(WAIT_S):
+            stop.leave("Stopped before there was a fleet.")
+            raise NoRouter(f"Stopped while waiting for a fleet at {endpoint}.")
+
+
+class ShiftEnd:
+    """Whether the shift has ended: all participants have left, and every job is settled.
+
+    Attributes:
+        sentence: How it ended; "" before.
+    """
+
+    def __init__(self) -> None:
+        self.sentence = ""
+        self._seen, self._gone_s = False, math.inf
+
+    def check(self, fleet: FleetSnapshot, real_s: float) -> str:
+        """Return how the shift ended; "" if it goes on."""
+        present = any(each.token for each in (*fleet.arms, *fleet.auctioneers))
+        self._seen |= present
+        self._gone_s = math.inf if present or not self._seen else min(self._gone_s, real_s)
+        total, open_jobs = sum(fleet.counts.values()), sum(fleet.counts.get(state, 0) for state in OPEN)
+        if real_s >= self._gone_s + GONE_S and total and not open_jobs:
+            counts = {state.replace("_", " "): fleet.counts.get(state, 0) for state in SETTLED[1:]}
+            rest = [f"{count} {state}" for state, count in counts.items() if count]
+            finished = f"{fleet.counts.get('finished', 0)} of {total} jobs finished"
+            self.sentence = f"The shift has ended: {', '.join([finished, *rest])}."
+        return self.sentence
+
+
+def draw(
+    listener: FleetListener,
+    news: deque[str],
+    ended: Callable[[FleetSnapshot], bool],
+    *,
+    joints: bool,
+    end_s: float | None,
+) -> None:
+    """Draw a screen that fills the terminal, again and again until the end or the key q."""
+    bars = JobBars()
+    with pressed_keys() as pressed, Live(console=out_console, screen=True, auto_refresh=False) as live:
+        while not ended(fleet := listener.view.snapshot(time.monotonic(), jobs=0)):
+            listener.serve(time.monotonic() + FRAME_S)
+            keys = pressed()
+            if "q" in keys:
+                break
+            joints ^= keys.count("j") % 2 == 1
+            size = out_console.size
+            how = {"width": size.width, "joints": joints, "done": bars.update(fleet), "end_s": end_s}
+            live.update(screen(fleet, list(news), size.height, **how), refresh=True)
+
+
+@contextmanager
+def pressed_keys() -> Iterator[Callable[[], str]]:
+    """A function that returns the keys pressed since it was last called, in lower case; none without a terminal."""
+    try:
+        import termios
+        import tty
+
+    except ModuleNotFoundError:  # Windows
+        yield lambda: ""
+        return
+    try:
+        before = termios.tcgetattr(sys.stdin.fileno())
+    except (OSError, ValueError, termios.error):  # no terminal, or closed
+        yield lambda: ""
+        return
+
+    def pressed() -> str:
+        keys = ""
+        while select.select([sys.stdin], [], [], 0.0)[0] and (more := os.read(sys.stdin.fileno(), 64)):
+            keys += more.decode("ascii", "ignore").lower()
+        return keys
+
+    try:
+        tty.setcbreak(sys.stdin.fileno())
+        yield pressed
+    finally:
+        termios.tcsetattr(sys.stdin.fileno(), termios.TCSADRAIN, before)
+
+
+def print_lines(
+    listener: FleetListener,
+    news: deque[str],
+    ended: Callable[[FleetSnapshot], bool],
+    *,
+    joints: bool,
+    end_s: float | None,
+) -> None:
+    """Print news as they come, and a line about every arm from time to time, until the end."""
+    due_s = time.monotonic() + SNAPSHOT_S
+    while not ended(fleet := listener.view.snapshot(time.monotonic(), jobs=0)):
+        listener.serve(time.monotonic() + FRAME_S)
+        while news:
+            echo(news.popleft())
+        if time.monotonic() >= due_s:
+            due_s = time.monotonic() + LINE_S
+            for arm in fleet.arms:
+                echo(arm_line(arm, joints=joints))
+            echo(jobs_line(fleet).plain)
+            echo(space_line(fleet).plain)
+            if end_s is not None:
+                echo(time_line(fleet, end_s).plain)
+
+
+def describe(name: str, message: msgspec.Struct) -> str:
+    """Line about an event or a result; "" for other messages."""
+    if isinstance(message, ArmEvent):
+        return f"{format_time(message.time_s)}  {name} {plain_event(message)}"
+    if isinstance(message, Result):
+        return f"{format_time(message.time_s)}  job {describe_status(message.status)}"
+    return ""
 
 
 class JobBars:
@@ -94,45 +291,38 @@ def screen(
     if len(arms) < len(fleet.arms):
         parts.append(Text(f"… and {len(fleet.arms) - len(arms)} more with more headroom", style="dim"))
     parts += [jobs_line(fleet), space_line(fleet)]
-    parts += [Text(event, style="dim", no_wrap=True, overflow="ellipsis") for event in events]
-    return Group(*parts, Text(KEYS, style="dim", no_wrap=True, overflow="ellipsis"))
+    return Group(*parts, *(_line((text, "dim")) for text in (*events, KEYS)))
+
+
+def _line(*parts: str | tuple[str, str]) -> Text:
+    """One line of texts, some with a style; its end is cut off on a narrow terminal."""
+    return Text.assemble(*parts, no_wrap=True, overflow="ellipsis")
 
 
 def heading(fleet: FleetSnapshot) -> Text:
     """Fleet, number of arms present, auctioneer."""
     present = sum(arm.present for arm in fleet.arms)
     auctioneers = ", ".join(each.auctioneer for each in fleet.auctioneers if each.token)
-    text = Text(no_wrap=True, overflow="ellipsis")
-    text.append(fleet.fleet, style="bold")
-    text.append(f"   {present} of {len(fleet.arms)} arms present", style="" if present == len(fleet.arms) else "yellow")
-    text.append(f"   auctioneer {auctioneers}" if auctioneers else "   no auctioneer")
-    return text
+    arms = (f"   {present} of {len(fleet.arms)} arms present", "" if present == len(fleet.arms) else "yellow")
+    return _line((fleet.fleet, "bold"), arms, f"   auctioneer {auctioneers}" if auctioneers else "   no auctioneer")
 
 
 def time_line(fleet: FleetSnapshot, end_s: float | None = None) -> Text:
     """Fleet time, its speed, and what is left of the shift."""
-    times = [arm.time_s for arm in fleet.arms if arm.time_s is not None and arm.present]
-    text = Text(no_wrap=True, overflow="ellipsis")
-    if not times:
-        text.append("no time yet")
-        return text
-    now_s = max(times)
+    now_s = max((arm.time_s for arm in fleet.arms if arm.time_s is not None and arm.present), default=None)
+    if now_s is None:
+        return _line("no time yet")
     if end_s is None:
-        text.append(format_time(now_s))
-    else:
-        left_s = max(0.0, end_s - now_s)
-        text.append(f"{bar(now_s / end_s, 2 * HEAT_CELLS)} {format_time(now_s)} of {format_time(end_s)}, ")
-        text.append(f"{format_time(left_s)} left")
-        if fleet.speed and fleet.speed != 1.0:
-            text.append(f" ({brief(left_s / fleet.speed)} at {fleet.speed:g} ×)")
-    return text
+        return _line(format_time(now_s))
+    left_s, so_far = max(0.0, end_s - now_s), bar(now_s / end_s, 2 * HEAT_CELLS)
+    speed = fleet.speed or 1.0
+    real = f" ({brief(left_s / speed)} at {speed:g} ×)" if speed != 1.0 else ""
+    return _line(f"{so_far} {format_time(now_s)} of {format_time(end_s)}, {format_time(left_s)} left{real}")
 
 
 def arm_table(arms: Iterable[ArmSnapshot], done: Mapping[str, float] = NOTHING_DONE, *, wide: bool = False) -> Table:
     """One row per arm; `wide` adds scores of open jobs and ages of messages."""
-    table = _table()
-    table.add_column("arm", min_width=5, no_wrap=True)
-    table.add_column("mode", min_width=7, no_wrap=True)
+    table = _table_of_arms()
     table.add_column("to warning", min_width=HEAT_CELLS + 1, no_wrap=True)
     table.add_column("hot °C", min_width=7, no_wrap=True, justify="right")
     table.add_column("room K", min_width=6, no_wrap=True, justify="right")
@@ -164,9 +354,7 @@ def arm_table(arms: Iterable[ArmSnapshot], done: Mapping[str, float] = NOTHING_D
 def joint_table(arms: Iterable[ArmSnapshot]) -> Table:
     """One row per arm with the temperature of every motor; ! marks little headroom, !! none."""
     arms = tuple(arms)
-    table = _table()
-    table.add_column("arm", min_width=5, no_wrap=True)
-    table.add_column("mode", min_width=7, no_wrap=True)
+    table = _table_of_arms()
     joints = max((len(arm.temp_c) for arm in arms), default=0)
     for joint in range(joints):
         table.add_column(f"J{joint + 1} °C", justify="right", min_width=6, no_wrap=True)
@@ -212,7 +400,7 @@ def plain_event(event: ArmEvent) -> str:
 def jobs_line(fleet: FleetSnapshot) -> Text:
     """Number of jobs in each state."""
     counts = ", ".join(f"{fleet.counts[state]} {state}" for state in get_args(JobState) if fleet.counts.get(state))
-    return Text(f"jobs: {counts or 'none'}", no_wrap=True, overflow="ellipsis")
+    return _line(f"jobs: {counts or 'none'}")
 
 
 def space_line(fleet: FleetSnapshot) -> Text:
@@ -223,7 +411,7 @@ def space_line(fleet: FleetSnapshot) -> Text:
         arm = arms.get(name)
         where = "not present" if arm is None or not arm.present else "away from home" if arm.away else "has a job"
         parts.append(f"{name} ({where}{', may be anywhere' if ANYWHERE in spaces else ''})")
-    return Text(f"space closed by: {', '.join(parts) or 'none'}", no_wrap=True, overflow="ellipsis")
+    return _line(f"space closed by: {', '.join(parts) or 'none'}")
 
 
 def arm_line(arm: ArmSnapshot, *, joints: bool = False) -> str:
@@ -253,7 +441,7 @@ def format_scores(arm: ArmSnapshot) -> str:
 
     def heat(item: tuple[str, JobScore]) -> tuple[float, float, str]:
         name, score = item
-        peak_c, difficulty = (inf if each is None else each for each in (score.peak_c, score.difficulty))
+        peak_c, difficulty = (math.inf if each is None else each for each in (score.peak_c, score.difficulty))
         return peak_c, difficulty, name
 
     parts: list[str] = []
@@ -282,8 +470,7 @@ def format_age(seconds: float | None) -> str:
 
 def format_time(time_s: float) -> str:
     """Fleet time: `1:02:03`."""
-    minutes, seconds = divmod(int(time_s), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
+    return clock(int(time_s))
 
 
 def _headroom_style(headroom_k: float | None) -> str:
@@ -303,5 +490,8 @@ def _name_and_mode(arm: ArmSnapshot) -> tuple[str, Text]:
     return arm.arm, Text(mode, style=_MODE_STYLES.get(mode, ""))
 
 
-def _table() -> Table:
-    return Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), expand=True, header_style="dim")
+def _table_of_arms() -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), expand=True, header_style="dim")
+    table.add_column("arm", min_width=5, no_wrap=True)
+    table.add_column("mode", min_width=7, no_wrap=True)
+    return table

@@ -1,11 +1,13 @@
 """Times, events and offers in words."""
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from fleet.events import Event
-from scenarios.run.records import Offer
 
-CANNOT = "cannot do it"
+if TYPE_CHECKING:  # slow to import
+    from scenarios.run.records import Offer
+
 SEVERITY = {
     "warning": "warning", "torque_warning": "warning", "return": "warning", "give_up": "error", "expire": "warning",
     "fault": "error", "contact": "error", "illegal": "warning",
@@ -60,19 +62,13 @@ def event_text(event: Event) -> str:
     return f"{event.kind.replace('_', ' ')}{f' {event.job}' if event.job else ''}{joint}{reason}"
 
 
-def scores_text(offer: Offer) -> list[str]:
-    """P(saturation), predicted peak and difficulty of an offer, as far as they are known."""
+def offer_text(offer: "Offer") -> str:
+    """P(saturation), predicted peak, difficulty and duration of an offer, and why the arm could not take the job."""
+    if not offer.feasible:
+        return "cannot do it"
     parts = [f"P {offer.p_saturation:.2f}"] if offer.p_saturation is not None else []
     parts += [f"{offer.peak_c:.0f} °C"] if offer.peak_c is not None else []
     parts += [f"d {offer.difficulty:.2f}"] if offer.difficulty is not None else []
-    return parts
-
-
-def offers_text(offers: Sequence[Offer]) -> str:
-    """What each arm knew of a job, the winner first."""
-    parts: list[str] = []
-    for offer in sorted(offers, key=lambda o: (not o.awarded, o.arm)):
-        known = scores_text(offer) if offer.p_saturation is not None else [CANNOT]
-        known += [offer.state] if not offer.free and offer.feasible else []
-        parts.append(f"{offer.arm} ({', '.join(known)})")
-    return "; ".join(parts)
+    parts.append(f"{(offer.duration_s or 0.0) / 60:.0f} min")
+    barred = "" if offer.free else f" ({offer.state if offer.state != 'idle' else 'place or space taken'})"
+    return ", ".join(parts) + barred

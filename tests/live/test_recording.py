@@ -37,8 +37,7 @@ from scenarios.cli.main import main
 from scenarios.live.recorder import Recorder, lock_folder, record
 from scenarios.live.recording import CARD, open_messages, part_files, read_card, read_parts, replay
 from scenarios.live.recording_report import heat_use, open_recording, order_events
-from scenarios.run.records import ShiftLog
-from scenarios.run.schedule import schedule
+from scenarios.run.records import ShiftLog, schedule
 from scenarios.show.run_page import report_html
 from tests.profiles import examples
 from tests.waiting import PATIENCE_S, serve_until, wait_until

@@ -21,7 +21,6 @@ from fleet.robot import Robot
 from scenarios.cli.main import main
 from scenarios.motion.generate import bare_arm
 from scenarios.prepare.twins import cold_peaks, records
-from scenarios.terminal import progress_bar
 from twin.vae.config import TwinConfig
 from twin.vae.train import train
 
@@ -116,7 +115,7 @@ def thermofleet(
     """The command line: `thermofleet("run", path, "--seed", 3)`."""
     monkeypatch.setenv("THERMOFLEET_CACHE", str(plans))
     # A stage that is slow on a slow machine prints a line of progress; what a command prints shall not depend on that.
-    monkeypatch.setitem(progress_bar.__wrapped__.__kwdefaults__, "after_s", 1e6)  # type: ignore[attr-defined]
+    monkeypatch.setattr("scenarios.terminal.AFTER_S", 1e6)
 
     def call(*args: object) -> CommandResult:
         with pytest.raises(SystemExit) as left:

@@ -23,9 +23,8 @@ from fleet.bus.protocol.keys import CHANNEL, STATE_HZ
 from fleet.errors import MAX_NAME, FleetError
 from fleet.fields import check, option, options_of
 from fleet.robot import ThermalLimits
-from scenarios.cli.from_fields import From, Given, flags_of, with_fields
 from scenarios.cli.main import COMMANDS, GROUPS, MOVED, load_command
-from scenarios.cli.options import channel_of
+from scenarios.cli.options import From, Given, channel_of, flags_of, with_fields
 from scenarios.live.gateway import ROLES
 from scenarios.run.log import FILES
 from scenarios.spec.load import library, load
@@ -48,7 +47,7 @@ def test_a_run_prints_its_figures_and_leaves_four_files(thermofleet, small_toml,
     assert sorted(p.name for p in out.iterdir()) == sorted(FILES)
     printed = run_json(out)
     assert printed["status"] == "finished"
-    for label in ("jobs finished", "value", "on time", "faults", "min above warning", "energy, Wh"):
+    for label in ("jobs finished", "value", "on time", "faults", "above warning, min", "energy to heat, Wh"):
         assert label in said.out
     assert f"{printed['metrics']['finished']} of {printed['metrics']['jobs']}" in said.out
     for arm, peak_c in printed["metrics"]["peak_c"].items():

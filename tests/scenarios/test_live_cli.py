@@ -39,8 +39,7 @@ from fleet.job import Job, Place, Work
 from fleet.live.job_client import batches
 from scenarios.live import auctioneer as live_auction
 from scenarios.live.arm import ambient_of, replayed_arm, simulated_arm, wait_for_name
-from scenarios.live.auctioneer import job_spec, scenario_jobs
-from scenarios.live.journals import refuse_other_way
+from scenarios.live.auctioneer import job_spec, refuse_other_way, scenario_jobs
 from scenarios.live.requests import read_jobs
 from scenarios.prepare.fleet import make_env, prepare, prepare_arm
 from scenarios.progress import quiet

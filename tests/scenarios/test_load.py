@@ -26,11 +26,11 @@ from fleet.events import Event
 from fleet.job import Fixture
 from scenarios.cell_layout import cell_of
 from scenarios.cli.main import main
-from scenarios.cli.run import metrics_table
 from scenarios.prepare.fleet import prepare, prepare_arm
 from scenarios.run.shift import run
 from scenarios.show.layout import layout_report
 from scenarios.show.plan import draw_plan
+from scenarios.show.run_page import figure_table
 from scenarios.spec.jobs import all_works, draw_jobs, rehearsal_works, works_of
 from scenarios.spec.load import library, load, own_seed
 from scenarios.spec.options import RunSpec
@@ -767,5 +767,5 @@ def test_contacts_are_counted_by_the_plant_that_finds_them(small_scenario, plans
     steps = 6 if plant == "mujoco" else 0
     assert result.metrics.contacts == (steps or None)
     assert result.events.count(touch) == steps
-    figures = [row[0] for row in metrics_table({"round_robin": result.metrics}).rows]
+    figures = [row[0] for row in figure_table({"round_robin": result.card["metrics"]}).rows]
     assert ("contacts" in figures) == (plant == "mujoco")

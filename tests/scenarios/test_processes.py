@@ -218,7 +218,7 @@ def interrupted(stage: str, **bar: str) -> str:
         return str(error)
 
 
-def test_without_a_terminal_a_long_stage_says_what_goes_on_how_many_and_how_long(capsys):
+def test_without_a_terminal_a_long_stage_says_what_goes_on_how_many_and_how_long(capsys, monkeypatch):
     """The lines come while a step reports nothing, as one that trains for a quarter of an hour."""
     lines: list[str] = []
 
@@ -228,7 +228,9 @@ def test_without_a_terminal_a_long_stage_says_what_goes_on_how_many_and_how_long
         lines.extend(said.err.splitlines())
         return len(lines) >= count
 
-    with progress_bar(after_s=1.0, every_s=0.1) as progress:
+    monkeypatch.setattr("scenarios.terminal.AFTER_S", 1.0)
+    monkeypatch.setattr("scenarios.terminal.EVERY_S", 0.1)
+    with progress_bar() as progress:
         progress("planning", 0.5)  # over at once: no line
         progress("training", Count(1, 4))
         wait_until(lambda: has_said(3))

@@ -15,7 +15,9 @@ from fleet.motion import RATE_HZ
 from fleet.robot import Robot
 from scenarios.prepare.arms import hardware_of
 from scenarios.prepare.calibrate import own_logs
+from scenarios.result_folder import json_text
 from scenarios.show import twin_report as report
+from scenarios.show.page import sections_page
 from scenarios.spec.load import load
 from scenarios.table import Table
 from twin.logs.recording import Recording
@@ -151,7 +153,7 @@ def test_an_event_that_never_or_always_happens_has_no_auroc():
 def test_generated_windows_lie_near_their_source(subject, chapters):
     (table,) = chapters["generation"].tables
     assert [row[0] for row in table.rows] == ["twin, s = 0", "twin, s = 1", "untrained network, s = 1"]
-    made = subject.make("twin", subject.twin, 0.0, 1)
+    made = subject.make(subject.twin, 0.0, 1)
     ((source, motion),) = made.pairs
     assert made.distance_rad == pytest.approx(np.sqrt(np.mean((motion - source)[:, 0] ** 2)))
     assert table.rows[0][2] == f"{made.distance_rad:.3f}"
@@ -161,16 +163,16 @@ def test_generated_windows_lie_near_their_source(subject, chapters):
 
 def test_the_page_holds_every_chapter_in_the_order_of_the_paper(chapters, subject, tmp_path):
     origin = report.origin_of([subject]) | {"command": "thermofleet twin report <x>"}
-    card = report.write(list(chapters.values()), origin, tmp_path, "The twin & more")
+    failed = report.write(list(chapters.values()), origin, tmp_path, "The twin & more")
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     order = ["data", "latent", "reconstruction", "difficulty", "epochs", "generation"]
     assert re.findall(r'<section id="(\w+)"', text) == list(chapters) == order
     assert not re.search(r'(?:src|href)="(?!data:|#)', text)
     for words in ("The twin & more", "twin report <x>", subject.twin.version, "untrained", "RMS torque"):
         assert words in words_of(text)
-    assert text == report.report_page("The twin & more", list(chapters.values()), origin)
+    assert text == sections_page("The twin & more", list(chapters.values()), origin, report.LIMITS)
     stored = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
-    assert stored["failed"] == card["failed"] == {}
+    assert stored["failed"] == failed == {}
     assert list(stored["chapters"]) == order
     assert all(len(chapter.charts) == 1 for chapter in chapters.values())
     assert sorted(p.name for p in tmp_path.iterdir()) == ["report.html", "report.json"]
@@ -182,7 +184,7 @@ def test_a_chapter_that_fails_leaves_its_reason_and_the_others(subject):
     failed = {each.key: each.failed for each in chapters if each.failed}
     assert set(failed) == {"data", "reconstruction", "difficulty"}
     assert "0 of 6 recordings or jobs get hot" in str(failed["data"])
-    words = words_of(report.report_page("Title", chapters, {}))
+    words = words_of(sections_page("Title", chapters, {}))
     assert "3 of 6 sections could not be computed: Training data" in words
     assert words.count("Not computed: ") == 3
 
@@ -207,8 +209,8 @@ def test_spread_is_the_sample_deviation():
 
 
 def test_not_a_number_becomes_null():
-    values = {"dots": np.arange(3), "none": float("nan"), "one": np.float64(1.5), "rows": ((1,),)}
-    assert report.plain(values) == {"dots": [0, 1, 2], "none": None, "one": 1.5, "rows": [[1]]}
+    values = {"dots": np.array([0.0, np.nan]), "none": float("nan"), "one": np.float64(1.5), "rows": ((1,),)}
+    assert json.loads(json_text(values)) == {"dots": [0.0, None], "none": None, "one": 1.5, "rows": [[1]]}
 
 
 def test_a_table_with_odd_rows_is_refused():

@@ -13,7 +13,7 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from scenarios.run.log import RunLog, open_run
-from scenarios.show.run_page import pair_page
+from scenarios.show.run_page import runs_page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
@@ -108,8 +108,8 @@ def test_the_keyboard_plays_and_turns(page: Page) -> None:
 
 @pytest.mark.parametrize("width", [390, 1200])
 def test_two_shifts_play_in_step(browser: Browser, run: RunLog, tmp_path: Path, width: int) -> None:
-    reports = {f"{name}.html": replace(run, card={**run.card, "policy": name}) for name in ("one", "other")}
-    (tmp_path / "index.html").write_text(pair_page("two", ["a shift"], reports, run.cell_model()), encoding="utf-8")
+    text = runs_page({name: replace(run) for name in ("one", "other")}, model=run.cell_model())
+    (tmp_path / "index.html").write_text(text, encoding="utf-8")
     page = browser.new_page(viewport={"width": width, "height": 900})
     page.goto((tmp_path / "index.html").as_uri())
     page.wait_for_selector("body[data-ready]", timeout=300_000)

@@ -86,7 +86,7 @@ def test_a_run_in_another_version_of_the_environment_is_refused_by_name(run_fold
     assert card["environment"] == "allocation_v2"
     (copied / "run.json").write_text(json.dumps(card | {"environment": "allocation_v1"}), encoding="utf-8")
     with pytest.raises(
-        FleetError, match=r"is a run of format 6 in allocation_v1; this version reads 6, allocation_v2\."
+        FleetError, match=r"is a run of format 6 in allocation_v1; this version reads 6 in allocation_v2\."
     ):
         open_run(copied)
 
@@ -326,10 +326,10 @@ def test_runs_side_by_side_are_one_page_and_one_table(run_folder: Path, thermofl
     sheet = openpyxl.load_workbook(tmp_path / "two.xlsx").active
     cells = {row[0]: row[1:] for row in sheet.iter_rows(values_only=True)}
     lines = [line.split(",") for line in (tmp_path / "two.csv").read_text(encoding="utf-8").splitlines()]
-    assert cells[None] == ("run", "again")
+    assert cells[None] == ("run", "again", "difference")
     metrics = open_run(run_folder).metrics
-    assert cells["jobs finished"] == (metrics.finished, metrics.finished)
-    assert ["jobs finished", str(metrics.finished), str(metrics.finished)] in lines
+    assert cells["jobs finished"] == (metrics.finished, metrics.finished, 0)
+    assert ["jobs finished", str(metrics.finished), str(metrics.finished), "0"] in lines
     for wrong, told in ((tmp_path, "must be of `thermofleet run`"), (run_folder, "given twice")):
         with pytest.raises(SystemExit):
             main(["report", str(run_folder), str(wrong)])

@@ -24,8 +24,7 @@ class Served:
         self.thread = threading.Thread(target=lambda: asyncio.run(self.run()))
 
     async def run(self):
-        stuck_s = self.options.get("stuck_s", 10.0)
-        with listen("127.0.0.1", self.port, stuck_s) as bound, BusClient(self.endpoint, "f") as link:
+        with listen("127.0.0.1", self.port) as bound, BusClient(self.endpoint, "f") as link:
             async with AsyncBridge(link, self.readers.wake) as self.gateway:
                 self.server = Server(application(self.gateway, self.readers, **self.options), self.readers)
                 self.port = bound.getsockname()[1]

@@ -308,8 +308,9 @@ def test_a_body_of_unknown_length_is_limited_too(gateway):
     line.close()
 
 
-def test_a_slow_body_is_a_timeout(router):
-    with Served(router, body_s=0.2) as served, socket.create_connection(("127.0.0.1", served.port)) as line:
+def test_a_slow_body_is_a_timeout(router, monkeypatch):
+    monkeypatch.setattr("scenarios.live.gateway.BODY_S", 0.2)
+    with Served(router) as served, socket.create_connection(("127.0.0.1", served.port)) as line:
         line.settimeout(PATIENCE_S)
         head = (
             "POST /v4/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n"
@@ -408,14 +409,16 @@ def test_a_reader_that_reconnects_misses_no_event(gateway, arm):
         assert events(file, lambda found: set(numbers_of(found)) >= {100, 101, 102, 103})
 
 
-def test_a_silent_stream_sends_heartbeats():
-    with Router() as empty, Served(empty.endpoint, heartbeat_s=0.05) as served, served.stream() as (_, file):
+def test_a_silent_stream_sends_heartbeats(monkeypatch):
+    monkeypatch.setattr("scenarios.live.gateway.HEARTBEAT_S", 0.05)
+    with Router() as empty, Served(empty.endpoint) as served, served.stream() as (_, file):
         assert any(": heartbeat" in file.readline() for _ in range(30))
 
 
-def test_a_stuck_reader_is_dropped_and_delays_no_other(router, arm):
+def test_a_stuck_reader_is_dropped_and_delays_no_other(router, arm, monkeypatch):
     big = "x" * 4000
-    with Served(router, stuck_s=0.5) as served, served.stream(receive_bytes=4096), served.stream() as (_, file):
+    monkeypatch.setattr("scenarios.live.gateway.STUCK_S", 0.5)
+    with Served(router) as served, served.stream(receive_bytes=4096), served.stream() as (_, file):
         wait_until(lambda: len(served.readers.connected) == 2)
         slowest_s = 0.0
         for number in range(600):  # far more than socket buffers hold
@@ -458,8 +461,9 @@ def test_the_number_of_readers_is_limited(gateway):
     ids=["bodies", "headers", "connections"],
 )
 def test_300_unfinished_requests_hold_nobody_up(router, arm, begun, monkeypatch):
-    monkeypatch.setattr("scenarios.live.gateway.HEADER_S", 3 * PATIENCE_S)
-    with Served(router, body_s=3 * PATIENCE_S) as served, ExitStack() as lines:
+    for limit in ("HEADER_S", "BODY_S"):
+        monkeypatch.setattr(f"scenarios.live.gateway.{limit}", 3 * PATIENCE_S)
+    with Served(router) as served, ExitStack() as lines:
         for _ in range(300):
             line = lines.enter_context(socket.create_connection(("127.0.0.1", served.port)))
             line.sendall(begun.encode())

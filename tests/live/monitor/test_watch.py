@@ -26,8 +26,18 @@ from fleet.bus.router import Router
 from fleet.events import EVENT_KINDS
 from fleet.live.monitor.snapshot import ArmSnapshot, FleetSnapshot, JobScore
 from scenarios.live.fleet_processes import free_port
-from scenarios.live.watch import GONE_S, ShiftEnd
-from scenarios.show.watch import PLAIN, JobBars, arm_line, format_age, format_scores, format_time, plain_event, screen
+from scenarios.show.watch import (
+    GONE_S,
+    PLAIN,
+    JobBars,
+    ShiftEnd,
+    arm_line,
+    format_age,
+    format_scores,
+    format_time,
+    plain_event,
+    screen,
+)
 from tests import commands
 from tests.waiting import PATIENCE_S
 
