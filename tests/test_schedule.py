@@ -76,6 +76,23 @@ def test_every_award_is_one_assignment_and_every_fault_one_outage(log: tuple[lis
     assert sum(o.end_s == HORIZON_S and not o.recovered for o in result.outages) == told["open"]
 
 
+def test_breaks_end_as_planned_where_a_failure_hides_their_end():
+    """50 to 100 s, and 150 to 300 s whose end is told; a failure meanwhile repeats the begin of the second one."""
+    log = [
+        Event(time_s=50.0, kind="break", arm="arm_0", value=50.0),
+        Event(time_s=150.0, kind="break", arm="arm_0", value=150.0),
+        Event(time_s=200.0, kind="failure", arm="arm_0"),
+        Event(time_s=230.0, kind="recover", arm="arm_0"),
+        Event(time_s=230.0, kind="break", arm="arm_0", value=70.0),
+        Event(time_s=300.0, kind="break_end", arm="arm_0"),
+        Event(time_s=20.0, kind="break_end", arm="arm_1"),
+    ]
+    found = [(each.arm, each.start_s, each.end_s) for each in schedule(log, ARMS, HORIZON_S).breaks]
+    assert found == [
+        ("arm_0", 50.0, 100.0), ("arm_0", 150.0, 300.0), ("arm_0", 230.0, 300.0), ("arm_1", 0.0, 20.0),
+    ]  # fmt: skip
+
+
 @given(logs())
 def test_an_arm_is_in_one_place_at_a_time(log: tuple[list[Event], dict[str, int]]) -> None:
     result = schedule(log[0], ARMS, HORIZON_S)

@@ -21,6 +21,7 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
+from fleet.bus.protocol.messages import encode
 from fleet.bus.protocol.operator import Cancel, Controlled, ControlRequest
 
 _LOG = logging.getLogger(__name__)
@@ -32,7 +33,7 @@ RETRY_S = 0.5
 STATUS_S = (0.5, 2.0)
 """Real seconds between two status requests: without an auctioneer, so without results; and with one, where they only
 report done cycles and lost results."""
-JOBS_PER_MESSAGE = 64
+JOBS_PER_MESSAGE, MAX_BYTES = 64, 48_000
 """A router may drop messages of more than 64 KiB."""
 
 
@@ -183,9 +184,16 @@ def _progress(status: JobStatus) -> tuple[object, ...]:
 
 def batches(jobs: Sequence[JobSpec]) -> Iterator[tuple[JobSpec, ...]]:
     """Split jobs into messages, each job after those that it waits for."""
-    ordered = in_order(jobs)
-    for start in range(0, len(ordered), JOBS_PER_MESSAGE):
-        yield tuple(ordered[start : start + JOBS_PER_MESSAGE])
+    batch, size = list[JobSpec](), 0
+    for job in in_order(jobs):
+        length = len(encode(job)) + 1
+        if len(batch) == JOBS_PER_MESSAGE or (batch and size + length > MAX_BYTES):
+            yield tuple(batch)
+            batch, size = [], 0
+        batch.append(job)
+        size += length
+    if batch:
+        yield tuple(batch)
 
 
 def in_order(jobs: Sequence[JobSpec]) -> Sequence[JobSpec]:

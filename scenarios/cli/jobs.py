@@ -10,7 +10,7 @@ from fleet.fields import argument, option
 from fleet.job import BOUNDS, DWELL_S
 from scenarios.cli import options
 from scenarios.table import Table
-from scenarios.terminal import print_either
+from scenarios.terminal import print_either, say
 
 if TYPE_CHECKING:  # the bus, which other commands do not load
     from fleet.bus.protocol.auction import JobStatus
@@ -68,10 +68,14 @@ def submit_command(
     if as_json and not quote:
         raise FleetError("--json is for --quote: leave it out.")
     from scenarios.live.requests import job_of, quote_jobs, read_jobs, submit_jobs
+    from scenarios.show.words import clock
     from scenarios.spec.job_table import SUFFIXES
 
     if file:
         jobs = read_jobs(file, shift_begin)
+        first_s = min((job.release_s for job in jobs.values()), default=0.0)
+        if first_s > 0 and not shift_begin:
+            say(f"Times count from fleet time 0: the first job is released at {clock(first_s)}. See --shift-begin.")
     else:
         fields = {"name": name or kind, "kind": kind, "places": place or [], "repetitions": repetitions}
         jobs = {1: job_of({**fields, "payload_kg": payload, "dwell_s": dwell, "force_n": force})}
@@ -110,8 +114,9 @@ def list_command(
         snapshot = listener.view.snapshot(time.monotonic())
         known = {job.job: job for job in snapshot.jobs if not names or job.job in names}
         with suppress(NoReply, Refused):  # results tell neither predicted ends nor why jobs wait
-            now = link.ask(keys.of_jobs(link.fleet, "status"), StatusRequest(), Status, timeout_s=LISTEN_S)
-            known |= {job.job: job for job in now.jobs if job.job in known}
+            asked = StatusRequest(tuple(names or ()))
+            now = link.ask(keys.of_jobs(link.fleet, "status"), asked, Status, timeout_s=LISTEN_S)
+            known |= {job.job: job for job in now.jobs}
     jobs = sorted(known.values(), key=lambda status: status.job)
     if unknown := sorted({*(names or ())} - {job.job for job in jobs}):
         near = nearest(unknown[0], [job.job for job in snapshot.jobs])

@@ -101,7 +101,12 @@ def forecast_command(
         MISSING,
     ),
     network: Path | None = options.NETWORK,
-    repeat: int = option("Number of repetitions.", 1, low=1, high=1_000_000),
+    repeat: int | None = option(
+        "Number of repetitions. Default: those of a job of a scenario, the most of them; 1 of a log.",
+        None,
+        low=1,
+        high=1_000_000,
+    ),
     ambient: float | None = option(
         "Ambient temperature, °C; default: as in the identification, or 22.", None, low=-40, high=60
     ),
@@ -128,10 +133,11 @@ def forecast_command(
     so_far = one_of(options.arm_recordings(log, arm, skip_damaged), log)
     path = Path(plan)
     if path.exists():
-        motion = one_of(options.arm_recordings(path, arm, skip_damaged, measured=False), path)
+        motion, repeat = one_of(options.arm_recordings(path, arm, skip_damaged, measured=False), path), repeat or 1
     else:
         with progress_bar() as progress:
-            motion = motion_of(plan, arm, progress)
+            motion, most = motion_of(plan, arm, progress)
+        repeat = repeat or most
     found = forecast(so_far, motion, repeat, network=identified, ambient_c=ambient)
     origin = {
         "log": so_far.name,

@@ -10,9 +10,12 @@ from scenarios.spec.jobs import works_of
 from scenarios.spec.load import load
 from twin.logs.recording import Recording
 
+SUFFIX = ".toml"
+"""Of scenario files."""
 
-def motion_of(job: str, arm: str | None = None, progress: Progress = quiet) -> Recording:
-    """One cycle of the arm's first plan for a job stream of a scenario, with its first payload.
+
+def motion_of(job: str, arm: str | None = None, progress: Progress = quiet) -> tuple[Recording, int]:
+    """One cycle of the arm's first plan for a job stream of a scenario, with its first payload; and its most cycles.
 
     Args:
         job: SCENARIO/JOB.
@@ -21,7 +24,8 @@ def motion_of(job: str, arm: str | None = None, progress: Progress = quiet) -> R
     Raises:
         FleetError: there is no such scenario, job or arm, or the arm cannot do the job.
     """
-    name, slash, stream = job.rpartition("/")
+    file, suffix, stream = job.partition(f"{SUFFIX}/")  # names of jobs may have slashes
+    name, slash, stream = (file + suffix[:-1], suffix, stream) if suffix else job.rpartition("/")
     if not slash:
         raise FleetError(f"--plan must be a file, or SCENARIO/JOB as quickstart/hold_part (got '{job}').")
     scenario = load(name)
@@ -40,4 +44,5 @@ def motion_of(job: str, arm: str | None = None, progress: Progress = quiet) -> R
     q, qd, tau = profile.transpose(1, 0, 2)
     places = " → ".join(place.name for place in work.places)
     title = f"{job} by {robot.robot.name}: {work.kind} {work.payload_kg:g} kg at {places}"
-    return Recording(name=title, time_s=np.arange(len(profile)) / RATE_HZ, q=q, qd=qd, tau=tau)
+    motion = Recording(name=title, time_s=np.arange(len(profile)) / RATE_HZ, q=q, qd=qd, tau=tau)
+    return motion, streams[stream].repetitions[1]

@@ -212,17 +212,20 @@ def _outages(arm: str, log: Sequence[Event], horizon_s: float) -> list[Outage]:
 
 
 def _breaks(arm: str, log: Sequence[Event], horizon_s: float) -> list[Outage]:
-    """Breaks of one arm, from its events in order; the log of one that began before may lack its begin."""
+    """Breaks of one arm, from its events in order; the log of one that began before may lack its begin.
+
+    The end of a break may be missing, too, if the arm failed meanwhile; it has the planned one then.
+    """
+    begins = [(event.time_s, event.time_s + event.value) for event in log if event.kind == "break"]
+    ends = [event.time_s for event in log if event.kind == "break_end"]
+    if ends and (not begins or ends[0] < begins[0][0]):
+        begins.insert(0, (0.0, ends[0]))
     out: list[Outage] = []
-    begin_s: float | None = 0.0
-    for event in log:
-        if event.kind == "break":
-            begin_s = event.time_s
-        elif event.kind == "break_end" and begin_s is not None:
-            out.append(Outage(arm=arm, start_s=begin_s, end_s=event.time_s, kind="break", recovered=True))
-            begin_s = None
-    if begin_s:
-        out.append(Outage(arm=arm, start_s=begin_s, end_s=max(horizon_s, begin_s), kind="break", recovered=False))
+    for begin_s, planned_s in begins:
+        planned_s = planned_s if isfinite(planned_s) else horizon_s
+        end_s = min((each for each in (*ends, planned_s) if each > begin_s), default=begin_s)
+        over = end_s <= horizon_s
+        out.append(Outage(arm=arm, start_s=begin_s, end_s=min(end_s, horizon_s), kind="break", recovered=over))
     return out
 
 

@@ -2,7 +2,9 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass
+from datetime import UTC, datetime, timedelta
 from itertools import combinations
+from zoneinfo import ZoneInfo
 
 import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
@@ -234,6 +236,8 @@ REGIMES = {
 """Sentences of the regimes of `LoadFactor`."""
 MOST_REASONS = 20
 """Reasons that are shown why an arm cannot do a job."""
+MOST_TIMES = 4
+"""Times of a trace in a description."""
 MOST_STREAMS = 64
 """Streams of jobs, or rows of a table, in a description."""
 
@@ -311,7 +315,7 @@ def _arms(scenario: Scenario) -> Table:
 def _jobs(scenario: Scenario) -> Table:
     """One row per stream, as sentences that fit any terminal."""
     rows = tuple(
-        (s.name, f"{_work(s)}\nworth {s.value:g}, due after {s.due_s / 60:g} min; {_arrivals(s)}")
+        (s.name, f"{_work(s)}\nworth {s.value:g}, due after {s.due_s / 60:g} min; {_arrivals(scenario, s)}")
         for s in scenario.jobs[:MOST_STREAMS]
     )
     more = len(scenario.jobs) - MOST_STREAMS
@@ -334,11 +338,22 @@ def _work(stream: JobStream) -> str:
             return f"{stream.kind} {where}, {loads} kg, {times} times"
 
 
+def _moment(scenario: Scenario, time_s: float) -> str:
+    """A time of the shift; as a date where its begin is one."""
+    if scenario.shift_begin is None:
+        return clock(time_s)
+    begin = datetime.fromisoformat(scenario.shift_begin)
+    zone = begin.tzinfo if scenario.time_zone is None else ZoneInfo(scenario.time_zone)
+    moment = (begin.astimezone(UTC) + timedelta(seconds=time_s)).astimezone(zone)
+    return f"{moment:%a %d %b %H:%M}"
+
+
 def _absences(scenario: Scenario) -> str:
     """Breaks and failures, a line each."""
     lines = [
-        f"\nbreak '{each.name}' of {', '.join(each.arms) or 'all arms'}: {clock(max(each.begin_s, 0.0))} to "
-        f"{clock(each.end_s)}, after the present {each.finish}"
+        f"\nbreak '{each.name}' of {', '.join(each.arms) or 'all arms'}: "
+        f"{_moment(scenario, max(each.begin_s, 0.0))} to {_moment(scenario, each.end_s)}, "
+        f"after the present {each.finish}"
         for each in scenario.breaks[:MOST_REASONS]
     ]
     if len(scenario.breaks) > MOST_REASONS:
@@ -352,7 +367,7 @@ def _absences(scenario: Scenario) -> str:
     return "".join(lines)
 
 
-def _arrivals(stream: JobStream) -> str:
+def _arrivals(scenario: Scenario, stream: JobStream) -> str:
     spec = stream.arrivals
     after = f", after {', '.join(stream.after)}" if stream.after else ""
     match spec.kind:
@@ -365,4 +380,7 @@ def _arrivals(stream: JobStream) -> str:
             return f"{spec.count} at {spec.start_s:g} s{again}{after}"
         case "trace":
             times_s = spec.times_s or ()
-            return f"a trace of {len(times_s)}{after}" if stream.numbered else f"one at {sum(times_s):g} s{after}"
+            if not stream.numbered:
+                return f"one at {_moment(scenario, sum(times_s))}{after}"
+            first = ", ".join(_moment(scenario, time_s) for time_s in times_s[:MOST_TIMES])
+            return f"{len(times_s)} at {first}{', …' if len(times_s) > MOST_TIMES else ''}{after}"

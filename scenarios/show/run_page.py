@@ -259,6 +259,20 @@ def lateness_text(log: ShiftLog, late: Sequence[LateJob]) -> str:
     return f"Late jobs: {jobs}. The latest, {first.job}, {how}: {_reason(log, first)}."
 
 
+def _late_table(log: ShiftLog) -> Table | None:
+    """The late jobs, with their reasons; None if there are none."""
+    late = late_jobs(log)
+
+    def row(each: LateJob) -> tuple[str, ...]:
+        over = "" if each.abandoned else duration(each.late_s)
+        return each.job, clock(each.due_s), over, each.state.replace("_", " "), _reason(log, each)
+
+    rows = tuple(map(row, late[:MOST_LATE]))
+    caption = f"The first {MOST_LATE} of {len(late)}." if len(late) > MOST_LATE else ""
+    head = ("job", "due", "late by", "state", "why")
+    return Table(head=head, rows=rows, caption=caption, numbers=False) if late else None
+
+
 def _reason(log: ShiftLog, late: LateJob) -> str:
     """What delayed a job most: its own work, or what the arms that can do it did while it waited."""
     own = sorted((span for span in log.plan.assignments if span.job == late.job), key=lambda span: span.start_s)
@@ -334,6 +348,7 @@ def _passed(log: ShiftLog, late: LateJob, able: Sequence[str], begin_s: float, e
     return f"{len(ahead)} other job{'s' * (len(ahead) > 1)} went first on {names_text(arms)}{which}"
 
 
+MOST_LATE = 50
 ROWS = 300
 """Most rows of the event table, and of the table of requests."""
 BEFORE_S = 5.0
@@ -390,6 +405,7 @@ def report_html(log: ShiftLog, model: Mapping[str, Any] | None = None) -> str:
         "how": " · ".join(_settings(card, log.arms)),
         "tiles": key_figures(card.get("metrics") or {}),
         "replay": replay is not None,
+        "late": _late_table(log),
         "events": _event_table(log.events),
         "awards": _award_table(log.offers, log.arms),
         "requests": _request_table(card.get("requests") or ()),

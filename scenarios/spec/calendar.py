@@ -5,8 +5,9 @@ shift, or as dates; with `shift_begin`, `h:mm` is a time of day. With `weekdays`
 arrivals of kind `weekly`. They become plain times here, so the rest of the product knows no calendar.
 """
 
+import re
 from collections.abc import Iterator, Mapping
-from datetime import UTC, datetime, time, timedelta, tzinfo
+from datetime import datetime, time, timedelta, tzinfo
 from math import ceil
 from typing import Any
 from zoneinfo import ZoneInfo
@@ -16,10 +17,12 @@ import numpy as np
 from fleet.engine.state import ABSENCE, BROKEN, FINISH_CYCLE, FINISH_JOB, no_absences
 from fleet.errors import ScenarioError, nearest, printable
 from fleet.seeding import child
-from scenarios.spec.job_table import DAY_S, seconds_of
+from scenarios.spec.job_table import DAY_S, seconds_of, since
 from scenarios.spec.schema import MOST_BREAKS, Scenario
 
 WEEKDAYS = ("monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday")
+LONGEST_NIGHT_S = 43_200.0
+"""Longest break from one day to the next: a longer one has its begin and end exchanged."""
 FAILURES = 3
 """Child of the seed of a shift that samples the failures of its arms."""
 _ROUNDING = 1e-9
@@ -91,7 +94,10 @@ def _break_times(
         first_s, last_s = (seconds_of(given[name], begin, horizon_s) for name in ("begin", "end"))
     except ValueError as error:
         raise ScenarioError(f"{where}: {error}.") from error
-    if last_s < first_s and begin is not None and isinstance(given["end"], str | time):
+    is_clock = isinstance(given["end"], time) or re.fullmatch(r"\d{1,2}:\d{2}(:\d{2})?", str(given["end"]))
+    if last_s < first_s and begin is not None and is_clock:
+        if last_s + DAY_S - first_s > LONGEST_NIGHT_S:
+            raise ScenarioError(f"{where}: it ends at {given['end']}, before it begins at {given['begin']}.")
         last_s += DAY_S
     yield entry | {"begin_s": first_s, "end_s": last_s}
 
@@ -129,8 +135,7 @@ def _days(given: object, begin: datetime | None, horizon_s: float, where: str) -
             raise ScenarioError(f"{where}: there is no day '{printable(str(name))}'{nearest(str(name), WEEKDAYS)}")
 
     def since_begin(date: datetime, clock: time) -> float:
-        local = datetime.combine(date, clock, begin.tzinfo)
-        return (local.astimezone(UTC) - begin.astimezone(UTC)).total_seconds()
+        return since(begin, datetime.combine(date, clock, begin.tzinfo))
 
     for day in range(-1, ceil(horizon_s / DAY_S) + 1):
         date = datetime.combine(begin.date() + timedelta(days=day), time())
@@ -162,13 +167,12 @@ def check_breaks(scenario: Scenario, file: str) -> None:
         for name in each.arms:
             if name not in arms:
                 raise ScenarioError(f"{file}: breaks[{i}].arms: there is no arm '{name}'{nearest(name, arms)}")
-    outside = [each for each in scenario.breaks if each.end_s <= 0 or each.begin_s >= scenario.horizon_s]
-    if len(outside) == len(scenario.breaks) > 0:
-        first = outside[0]
-        raise ScenarioError(
-            f"{file}: breaks: '{first.name}', {first.begin_s:g} to {first.end_s:g} s, and all others lie outside the "
-            f"shift of {scenario.horizon_s:g} s; is shift_begin right?"
-        )
+        if each.end_s <= 0 or each.begin_s >= scenario.horizon_s:
+            begin = f", which begins at {scenario.shift_begin}" if scenario.shift_begin else ""
+            raise ScenarioError(
+                f"{file}: breaks[{i}]: '{each.name}', {each.begin_s:g} to {each.end_s:g} s, lies outside the shift of "
+                f"{scenario.horizon_s:g} s{begin}: change its times, or leave it out."
+            )
 
 
 def absences_of(scenario: Scenario, seed: np.random.SeedSequence) -> np.ndarray:

@@ -37,9 +37,12 @@ MOST_NUMBERS, MOST_FAULTS = 5, 100
 MOST_COLUMNS = 100
 """Of a sheet."""
 DAY_S = 86_400.0
+YEARS = (1970, 2200)
 DATE = "a date with time and zone, as 2026-11-23T06:00+01:00"
 _CLOCK = re.compile(r"(\d{1,4}):([0-5]\d)(?::([0-5]\d(?:[.,]\d+)?))?")
-_ARROW, _OR = re.compile(r"\s*(?:->|→|>|,|;)\s*"), re.compile(r"\s*[|;,]\s*")
+_ARROW, _OR = re.compile(r"->|→|>|,|;"), re.compile(r"[|;,]")
+_DOTTED_CLOCK = re.compile(r"([01]?\d|2[0-3])[.,]([0-5]\d)")
+"""A time of day as it is written in German; seconds have one decimal or none, as a decision takes them."""
 _THOUSANDS = re.compile(r"[1-9]\d{0,2}(\.\d{3})+")
 _GERMAN_DATE = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4}) +(\d{1,2}:\d{2}.*)")
 _FLAGS = {
@@ -94,14 +97,19 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
         given_s = 3600 * hours + 60 * minutes + seconds
         if begin is None:
             return given_s
-        if given_s >= DAY_S:
-            raise ValueError(f"with shift_begin, h:mm is a time of day, before 24:00 (got '{text}')")
-        since_s = given_s - (begin - begin.replace(hour=0, minute=0, second=0, microsecond=0)).total_seconds()
-        if since_s < 0 and since_s + DAY_S > dialect.horizon_s:
+        if given_s > DAY_S:
+            raise ValueError(f"with shift_begin, h:mm is a time of day, up to 24:00 (got '{text}')")
+        midnight = begin.replace(hour=0, minute=0, second=0, microsecond=0)
+        today, tomorrow = (midnight + timedelta(days=days, seconds=given_s) for days in (0, 1))  # by the clock
+        since_s = since(begin, today)
+        if since_s < 0 and since(begin, tomorrow) > dialect.horizon_s:
             raise ValueError(
                 f"'{text}' is outside the shift, which begins at {begin:%H:%M} and ends before {text} of the next day"
             )
-        return since_s % DAY_S
+        return since_s if since_s >= 0 else since(begin, tomorrow)
+    if isinstance(cell, str) and (dotted := _DOTTED_CLOCK.fullmatch(text)):
+        seconds = f"{float(text.replace(',', '.')):.3f}"
+        raise ValueError(f"is this {dotted[1]}:{dotted[2]}? Give times as h:mm, or seconds as {seconds}")
     with suppress(ValueError):
         return _number(cell, dialect)
     if german := _GERMAN_DATE.fullmatch(text):
@@ -113,8 +121,14 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
         raise ValueError(f"expected seconds, h:mm, h:mm:ss, or {DATE} (got {_shown(cell)})") from None
     if begin is None:
         raise ValueError(f"a date needs shift_begin, the begin of the shift (got {_shown(cell)})")
-    date = date if date.tzinfo else date.replace(tzinfo=begin.tzinfo)
-    return (date.astimezone(UTC) - begin.astimezone(UTC)).total_seconds()  # within one zone, dates ignore summer time
+    if not YEARS[0] <= date.year <= YEARS[1]:
+        raise ValueError(f"expected a year from {YEARS[0]} to {YEARS[1]} (got {date.year})")
+    return since(begin, date if date.tzinfo else date.replace(tzinfo=begin.tzinfo))
+
+
+def since(begin: datetime, date: datetime) -> float:
+    """Time from one date to another, s; within one zone, the difference of dates would ignore summer time."""
+    return (date.astimezone(UTC) - begin.astimezone(UTC)).total_seconds()
 
 
 def seconds_of(given: object, begin: datetime | None, horizon_s: float) -> float:
@@ -146,7 +160,7 @@ def _places(cell: Cell, _: object) -> tuple[tuple[str, ...], ...]:
     if isinstance(cell, list):
         lists = cell if all(isinstance(each, list) for each in cell) else [cell]
         return tuple(tuple(map(_text, each)) for each in lists)
-    return tuple(tuple(_ARROW.split(each.strip())) for each in _text(cell).split("|"))
+    return tuple(tuple(name.strip() for name in _ARROW.split(each)) for each in _text(cell).split("|"))
 
 
 def _flag(cell: Cell, _: object) -> bool:
@@ -521,6 +535,6 @@ def shift_begin(given: object, where: str, zone: tzinfo | None = None) -> dateti
             begin = datetime.fromisoformat(given)
     if begin in (None, ""):
         return None
-    if isinstance(begin, datetime) and (begin.tzinfo or zone):
+    if isinstance(begin, datetime) and (begin.tzinfo or zone) and YEARS[0] <= begin.year <= YEARS[1]:
         return begin.replace(tzinfo=begin.tzinfo or zone).astimezone(zone or begin.tzinfo)
     raise ScenarioError(f"{where} must be {DATE} (got {given}).")

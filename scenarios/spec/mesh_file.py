@@ -78,10 +78,14 @@ def _read(file: Path, where: str) -> Any:
     if (size := file.stat().st_size) > MOST_BYTES:
         raise ScenarioError(f"{where} has {size / 1e6:.0f} MB; at most {MOST_BYTES / 1e6:.0f} are allowed.")
     try:
-        mesh: Any = model_solid(file) if ending in MODELS else trimesh.load_scene(file).to_mesh()
+        mesh: Any = model_solid(file) if ending in MODELS else trimesh.load_scene(file, process=False).to_mesh()
     except Exception as error:  # readers of damaged files raise errors of many kinds
         reason = printable(" ".join(str(error).split()).rstrip(".:"), 200)
         raise ScenarioError(f"{where} cannot be read as {ending[1:].upper()}: {reason}.") from error
+    if not np.isfinite(mesh.vertices).all():
+        raise ScenarioError(f"{where} has corners that are no finite numbers; export the shape again.")
+    if ending in MESHES:
+        mesh.process(validate=False)  # joins corners that are the same
     if ending == ".glb":  # there y points up
         mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
     return mesh

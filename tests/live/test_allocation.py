@@ -25,7 +25,7 @@ from fleet.bus.protocol.auction import (
     Status,
     StatusRequest,
 )
-from fleet.bus.protocol.operator import Pause, Resume, Settle
+from fleet.bus.protocol.operator import ALL_ARMS, Pause, Resume, Settle
 from fleet.job import reason_to_give_up
 from fleet.live.auction.rounds import Assignment, Timing
 from fleet.live.space import ANYWHERE
@@ -389,7 +389,7 @@ def test_quotes_are_requested_for_the_cycles_that_are_left(auctioned):
     auctioned.submit(job("a", 500))
     auctioned.until(lambda: auctioned.status("a").cycles > 3)
     assert all(request.cycles == {} for request in asked)
-    auctioned.control(Pause(auctioned.holder("a")))
+    auctioned.control(Pause(ALL_ARMS))
     auctioned.until(lambda: auctioned.status("a").state == "waiting")
     cycles, before = auctioned.status("a").cycles, len(asked)
     auctioned.control(Resume())

@@ -4,9 +4,11 @@ from typing import Any
 
 import pytest
 
-from fleet.bus.protocol.auction import NOT_PLANNED, JobEstimate, JobSpec, PlanQuote, Quote
+from fleet.bus.protocol.auction import NOT_PLANNED, JobEstimate, JobSpec, PlanQuote, Quote, QuoteRequest
 from fleet.bus.protocol.messages import State
+from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.job_rules import why_not_ready
+from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.rounds import Bidding, reason_to_wait
 
 JOB = JobSpec(name="j", kind="hold", places=("bench",))
@@ -74,3 +76,31 @@ def test_a_job_that_cannot_be_begun_yet_says_why() -> None:
     assert why(90.0, {"one"}, {"u"}) == "It waits for 'two'."
     assert why(90.0, {"one", "two"}, {"v"}) == "Its place 'v' is in use."
     assert why(90.0, {"one", "two"}, set()) == ""
+
+
+def test_idle_arms_are_asked_for_their_space_before_there_was_any_job() -> None:
+    ledger = Ledger(arms=("a", "b"))
+    auctioneer = Auctioneer("x", ledger, allocate=lambda _: {}, keep=lambda *_: None, boot="1", real_s=0.0)
+    auctioneer.set_present(frozenset(["a", "b"]))
+    auctioneer.tick(1.0, 1.0)
+    (asked,) = (each for each in auctioneer.out if isinstance(each, QuoteRequest))
+    assert asked.dry_run
+    for arm in ("a", "b"):
+        auctioneer.add_quote(Quote(arm, asked.auction, "", 3.0, "t", 0.0, "idle", 9.0, 1, (), ()))
+    auctioneer.tick(1.1, 1.1)
+    assert not any(ledger.taken_space().values())
+
+
+def test_an_arm_that_names_another_space_each_time_does_not_flood_the_fleet() -> None:
+    ledger = Ledger(arms=("a",))
+    auctioneer = Auctioneer("x", ledger, allocate=lambda _: {}, keep=lambda *_: None, boot="1", real_s=0.0)
+    auctioneer.set_present(frozenset(["a"]))
+    asked = 0
+    for step in range(200):  # 10 s
+        auctioneer.tick(1.0 + 0.05 * step, 1.0)
+        for each in [each for each in auctioneer.out if isinstance(each, QuoteRequest)]:
+            asked += 1
+            space = (f"s{step}",)
+            auctioneer.add_quote(Quote("a", each.auction, "", 3.0, "t", 0.0, "idle", 9.0, 1, (), space))
+        auctioneer.out.clear()
+    assert asked <= 10

@@ -44,6 +44,9 @@ def hours(scenario: Scenario) -> list[tuple[float, float]]:
             "2026-03-29T06:00", "2026-03-29T07:00",
             {"shift_begin": "2026-03-28T20:00", "time_zone": "Europe/Berlin"}, (9.0, 10.0),
         ),
+        ("6:00", "7:00", {"shift_begin": "2026-03-29T00:00+01:00", "time_zone": "Europe/Berlin"}, (5.0, 6.0)),
+        ("6:00", "7:00", {"shift_begin": "2026-10-25T00:00+02:00", "time_zone": "Europe/Berlin"}, (7.0, 8.0)),
+        ("22:00", "24:00", {"shift_begin": "2026-11-23T06:00Z"}, (16.0, 18.0)),
     ],
 )  # fmt: skip
 def test_a_break_has_the_times_that_are_meant(begin, end, fields, expected) -> None:
@@ -92,8 +95,22 @@ BREAK = {"name": "lunch", "begin": "4:00", "end": "5:00"}
         ({"breaks": [BREAK | {"finish": "now"}]}, r"breaks\[0\].finish: 'now' is not allowed"),
         ({"breaks": [BREAK | {"begn": 3}]}, r"breaks\[0\]: unknown key 'begn'; did you mean 'begin_s'"),
         ({"breaks": [BREAK | {"weekdays": ["sunday"]}]}, r"weekdays need shift_begin, the begin of the shift"),
-        ({"breaks": [BREAK | {"begin": "90:00", "end": "91:00"}]}, "all others lie outside the shift of 172800 s"),
+        (
+            {"breaks": [BREAK, BREAK | {"name": "late", "begin": "90:00", "end": "91:00"}]},
+            r"breaks\[1\]: 'late', 324000 to 327600 s, lies outside the shift of 172800 s: change its times",
+        ),
+        ({"breaks": [BREAK | {"begin": "11.30"}]}, r"breaks\[0\]: is this 11:30\? Give times as h:mm"),
+        (
+            {"breaks": [BREAK | {"begin": "11:30", "end": "11:00"}], "shift_begin": "2026-11-23T06:00Z"},
+            r"breaks\[0\]: it ends at 11:00, before it begins at 11:30",
+        ),
         ({"time_zone": "Europe/Berln"}, "there is no time zone 'Europe/Berln'; give a name as Europe/Berlin"),
+        (
+            {"breaks": [BREAK | {"begin": "2026-11-23T10:00", "end": "2026-11-23T09:00"}],
+             "shift_begin": "2026-11-23T06:00Z"},
+            r"breaks\[0\].end_s must be after begin_s",
+        ),
+        ({"shift_begin": "9999-12-31T06:00Z"}, "shift_begin must be a date"),
         ({"shift_begin": "2026-11-23T06:00"}, "shift_begin must be a date with time and zone"),
         (
             {"breaks": [BREAK | {"weekdays": ["sun"]}], "shift_begin": "2026-11-23T06:00Z"},

@@ -53,7 +53,7 @@ from fleet.bus.protocol.operator import (
     Settle,
 )
 from fleet.errors import Refused
-from fleet.live.auction.job_rules import changed_spec
+from fleet.live.auction.job_rules import changed_spec, joined_reasons
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.records import AuctionRecord, ContactLost, ContactRegained, Operated, ShiftEnded, content_hash
 from fleet.live.auction.rounds import (
@@ -436,7 +436,7 @@ class Auctioneer:
         planned = not waits or self.rounds.is_planned(status.job)
         state = self.rounds.states.get(status.arm) if status.state in ("awarded", "finishing") else None
         finish_s = state.time_s + state.busy_s if state is not None and state.job == status.job else None
-        reason = " ".join(filter(None, (status.reason, note)))
+        reason = joined_reasons(status.reason, note)
         return replace(status, cycles=cycles, reason=reason, finish_s=finish_s, not_planned=not planned)
 
     def _is_open(self, entry: LeaseEntry, arm: str) -> bool:

@@ -204,6 +204,13 @@ def ready_jobs(
     return ready
 
 
+def joined_reasons(before: str, now: str) -> str:
+    """Return why a job waits again, and why no arm begins it now, in sentences."""
+    if not (before and now):
+        return before or now
+    return f"{before[0].upper()}{before[1:].rstrip('.')}. {now}"
+
+
 def why_not_ready(job: JobSpec, time_s: float, finished: Callable[[str], bool], busy: Container[str]) -> str:
     """Return why a waiting job cannot be begun by any arm now; "" if it can. Arguments as of `ready_jobs`."""
     if job.release_s > time_s:

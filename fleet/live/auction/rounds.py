@@ -513,6 +513,8 @@ def cleared_space(
 
 SCAN_S = 0.05
 """Real seconds between two checks for jobs that have become ready."""
+NO_JOB = JobSpec(name="space", kind="hold", places=("?",))
+"""A job that no arm can do, to ask arms for their space before there was any job."""
 NOT_OFFERED = "It has not been offered yet: at most {} jobs are at a time, the oldest first."
 
 
@@ -631,22 +633,24 @@ class Rounds:
         """
         ledger = self._writer.ledger
         takes_space = frozenset(arm for arm, names in ledger.closed_space().items() if names) & self.present
-        last = ledger.recent[-1].status.job if ledger.recent else ""
-        if not takes_space or real_s < self._space_s or last not in ledger.jobs:
+        if not takes_space or real_s < self._space_s:
             return
+        last = ledger.jobs.get(ledger.recent[-1].status.job) if ledger.recent else None
+        job = NO_JOB if last is None else last.spec
         self._space_s = real_s + self._space_pause_s
         self._space_pause_s = min(2 * self._space_pause_s, self._timing.pause_s[1])
         auction = self._open((), takes_space, real_s)
-        self._writer.out.append(QuoteRequest(auction, (ledger.jobs[last].spec,), dry_run=True))
+        self._writer.out.append(QuoteRequest(auction, (job,), dry_run=True))
 
     def _close(self, closing: Round, real_s: float, time_s: float) -> None:
         self.open = None
-        spaces = stated_spaces(self._writer.ledger, closing, time_s)
+        spaces, before = stated_spaces(self._writer.ledger, closing, time_s), self._writer.ledger.space
+        freed = any(frozenset(each.space) < before.get(each.arm, frozenset()) for each in spaces)
         if not self._writer.try_to_record("Nothing is awarded", *spaces):
             self.delay(real_s, (job.name for job in closing.jobs))
             return
         if not closing.jobs:
-            if spaces:
+            if freed:
                 self.retry_now()
             return
         entries = [self._writer.ledger.jobs[job.name] for job in closing.jobs]

@@ -39,6 +39,7 @@ from fleet.live.auction.job_rules import (
     SHIFT_ENDED,
     is_late,
     job_order,
+    joined_reasons,
     lost_jobs,
     ready_jobs,
     why_not_ready,
@@ -241,7 +242,7 @@ class KnownJobs:
         def reasons(status: JobStatus) -> str:
             not_ready = why_not_ready(jobs[status.job], time_s, self._register.is_finished, busy)
             note = self._refusal(status.job, present) or not_ready or why(status.job)
-            return " ".join(filter(None, (status.reason, note)))
+            return joined_reasons(status.reason, note)
 
         return [
             replace(each, reason=reasons(each)) if each.state == "waiting" and each.job in jobs else each

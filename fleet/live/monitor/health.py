@@ -12,7 +12,10 @@ import msgspec
 from fleet.live.clock import FleetClock
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetSnapshot
 
-EXPECTED = ("It is released at", "It waits for", "are paused", "has not been offered", "has a break")
+EXPECTED = (
+    "It is released at", "It waits for", "are paused", "has not been offered", "has a break", "are planning",
+    "is above its warning limit", "is faulted",
+)  # fmt: skip
 """Parts of the reasons of jobs that wait in order."""
 BY_POLICY = "The policy lets it wait"
 MOST_REASONS = 5
@@ -141,6 +144,12 @@ def check_progress(fleet: FleetSnapshot, earlier: FleetSnapshot | None) -> list[
     ]
 
 
+def _in_the_way(reason: str) -> list[str]:
+    """Arms until whose way a job waits, by its reason."""
+    _, _, rest = reason.partition("It waits until ")
+    return rest.partition(" is out of the way")[0].split(", ")
+
+
 def _at_work(fleet: FleetSnapshot) -> int:
     """Number of jobs that arms have."""
     return fleet.counts.get("awarded", 0) + fleet.counts.get("finishing", 0)
@@ -152,7 +161,7 @@ def check_space(fleet: FleetSnapshot) -> list[Finding]:
     silent_s = {arm.arm: arm.state_age_s for arm in fleet.arms if arm.state_age_s is not None}
     findings: list[Finding] = []
     for arm in sorted(fleet.space.keys() - present):
-        waits = sum(status.state == "waiting" and f"until {arm}" in status.reason for status in fleet.jobs)
+        waits = sum(status.state == "waiting" and arm in _in_the_way(status.reason) for status in fleet.jobs)
         since = f" for {silent_s[arm]:.0f} s" if arm in silent_s else ""
         findings.append(
             Finding(

@@ -277,7 +277,8 @@ class FleetView:
         last = 0 if job is None else job.number
         if number is not None and number < last:
             return
-        if job is None or job.status != status:
+        # A result has neither a predicted end nor why a job waits: it replaces a status that it changes.
+        if job is None or (job.status != status if number is None else _progress(job.status) != _progress(status)):
             job = self._jobs[status.job] = _Job(status, now_s)
         job.heard_s, job.number = now_s, max(last, number or 0)
 
@@ -342,6 +343,10 @@ class FleetListener:
             self.view.update_jobs(reply, time.monotonic())
         if not answers.refused:
             self.view.forget_other_jobs(replies, asked_s)
+
+
+def _progress(status: JobStatus) -> tuple[object, ...]:
+    return status.state, status.arm, status.award, status.cycles, status.due_s, status.value
 
 
 def describe_event(event: ArmEvent) -> str:
