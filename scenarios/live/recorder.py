@@ -192,7 +192,7 @@ class Recorder:
             cell=self.cell,
         )
         with self._draft(self.folder / CARD) as draft:
-            draft.write_text(json_text(card), encoding="utf-8")
+            draft.write_bytes(json_text(card).encode())
         self.parts, self._written = card.parts, card.rows
         self._rows.clear()
 

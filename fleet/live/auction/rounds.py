@@ -653,8 +653,9 @@ class Rounds:
             if freed:
                 self.retry_now()
             return
-        entries = [self._writer.ledger.jobs[job.name] for job in closing.jobs]
-        entries = [e for e, job in zip(entries, closing.jobs, strict=True) if e.state == "waiting" and e.spec == job]
+        waiting = self._writer.ledger.waiting  # a job may have been settled meanwhile, and have left
+        entries = [waiting[job.name] for job in closing.jobs if job.name in waiting]
+        entries = [entry for entry in entries if entry.spec in closing.jobs]
         jobs = tuple(entry.spec for entry in entries)
         quotes = {
             arm: self.sensors[arm].check_quote(quote)
