@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any  # a mesh of trimesh
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from fleet.errors import ScenarioError, printable
 from fleet.job import LEAST_FIXTURE_M, MOST_FIXTURE_M, Fixture
@@ -97,6 +96,7 @@ def _convex_parts(mesh: Any, where: str) -> list[np.ndarray]:
     Triangles are connected if they alone share an edge, so solids that touch stay apart.
     """
     import trimesh
+    from scipy.spatial import ConvexHull, QhullError  # slow to import
 
     solids: list[Any] = []
     flat: list[np.ndarray] = []

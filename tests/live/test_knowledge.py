@@ -44,7 +44,7 @@ live arms predict the cycles that are left, and simulated arms the whole job; an
 as working (`working`, `fleet_working`), as a live one takes no job."""
 HOUR_S = 3600.0
 NAMES = ("arm_0", "arm_1", "arm_2")
-CONSTANT = {"fleet_age_s"}
+CONSTANT = {"fleet_age_s", "break_in_s"}
 """Fields that have one value in these shifts."""
 TOO_HEAVY = 6.0
 """Rating of the last arm, kg."""
