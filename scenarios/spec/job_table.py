@@ -49,7 +49,7 @@ _FLAGS = {
     **dict.fromkeys(("yes", "true", "1", "hard", "ja", "wahr"), True),
     **dict.fromkeys(("no", "false", "0", "soft", "nein", "falsch"), False),
 }
-Told = TypeVar("Told", Admission, JobStatus)
+Answer = TypeVar("Answer", Admission, JobStatus)
 Cell = Any
 """A text, number, date, list or None, according to the file."""
 Rows = Iterator[tuple[int, Sequence[Cell]]]
@@ -363,19 +363,19 @@ def _check_force(row: Row) -> None:
         raise ValueError(f"only a press has a contact force (got {row.force_n:g} N for a {row.kind})")
 
 
-def with_cell(told: Told, jobs: Mapping[str, tuple[str, JobSpec]]) -> Told:
+def with_cell(answer: Answer, jobs: Mapping[str, tuple[str, JobSpec]]) -> Answer:
     """A decision or status whose reason, if any, begins with the row of the job and the column that it quotes.
 
     Args:
         jobs: The jobs of a table by name, each after its row.
     """
-    if not told.reason or told.job not in jobs:
-        return told
-    row, job = jobs[told.job]
+    if not answer.reason or answer.job not in jobs:
+        return answer
+    row, job = jobs[answer.job]
     columns = {"places": chain.from_iterable(job.every_places), "after": job.after, "name": (job.name,)}
-    quoted = (column for column, names in columns.items() if any(f"'{name}'" in told.reason for name in names))
+    quoted = (column for column, names in columns.items() if any(f"'{name}'" in answer.reason for name in names))
     place = ", column ".join([row, *islice(quoted, 1)])
-    return replace(told, reason=f"{place}: {told.reason}")
+    return replace(answer, reason=f"{place}: {answer.reason}")
 
 
 def _check_after(rows: Mapping[str, tuple[int, Row]], faults: _Faults, *, closed: bool) -> None:

@@ -26,6 +26,7 @@ from fleet.bus.protocol.auction import (
     Announcement,
     ArmOffer,
     Award,
+    JobEstimate,
     JobSpec,
     PlanQuote,
     Quote,
@@ -125,6 +126,18 @@ class Bidding:
             if offer.job in names
         }
 
+    def estimates(self, job: str) -> Mapping[str, JobEstimate]:
+        """Return what arms answered about a job, by arm."""
+        return self._estimates.get(job, {})
+
+    @cached_property
+    def _estimates(self) -> dict[str, dict[str, JobEstimate]]:
+        by_job: dict[str, dict[str, JobEstimate]] = {}
+        for arm, quote in sorted({**self.quotes, **self.full}.items()):
+            for each in quote.estimates:
+                by_job.setdefault(each.job, {}).setdefault(arm, each)
+        return by_job
+
     def has_free_stations(self, job: JobSpec) -> bool:
         """Return whether no arm is at work at the stations of a job."""
         return self.busy.isdisjoint(job.stations)
@@ -182,7 +195,7 @@ def offers_of(bidding: Bidding, job: str, awarded: Assignment) -> tuple[ArmOffer
     """Return what the arms offered for an awarded job: first the arm that gets it, then the others, best first."""
     offers: list[ArmOffer] = []
     for quote in (*bidding.quotes.values(), *bidding.full.values()):
-        estimate = next((each for each in quote.estimates if each.job == job), None)
+        estimate = bidding.estimates(job).get(quote.arm)
         plan = None if estimate is None or not estimate.feasible else estimate.least
         if quote.arm == awarded.arm:
             plan = bidding.offer(awarded.arm, job, awarded.plan)
@@ -240,9 +253,7 @@ def reason_to_wait(bidding: Bidding, job: str) -> str:
     """Return why no arm begins a job, by the quotes of a round that has just closed."""
     if any(each.name == job and not bidding.has_free_stations(each) for each in bidding.jobs):
         return "Its place was in use when it was last offered."
-    quotes = {**bidding.quotes, **bidding.full}
-    estimates = {arm: each for arm, quote in sorted(quotes.items()) for each in quote.estimates if each.job == job}
-    if not estimates:
+    if not (estimates := bidding.estimates(job)):
         return "No arm has answered whether it can do it."
     able = {arm: each.plans for arm, each in estimates.items() if each.feasible}
     if any(bidding.plans(arm, job) for arm in able):
