@@ -22,7 +22,7 @@ from fleet.heat.motor import gen3_motors
 from fleet.live.arm.awards import ArmHistory, AwardExecutor, ExecutorConfig
 from fleet.live.arm.body import SimulatedBody
 from fleet.live.arm.estimator import Estimator, NominalPeaks
-from fleet.live.arm.node import ArmConfig, ArmNode
+from fleet.live.arm.node import ArmConfig, ArmNode, PlanningThread
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.ledger import Ledger
@@ -53,6 +53,17 @@ TOO_HEAVY = 6.0
 def ambient_c(time_s: float) -> float:
     """Ambient temperature by fleet time, which changes every 100 s."""
     return 25.0 + time_s // 100.0
+
+
+@pytest.fixture(autouse=True)
+def planning_at_once(monkeypatch):
+    """Have arms plan before they reply, however slow the machine is: what is not planned in time has no scores."""
+
+    def plan(self, jobs, step, *, dry_run=False):
+        for job in jobs:
+            self._estimator.prepare(*job)
+
+    monkeypatch.setattr(PlanningThread, "plan", plan)
 
 
 class Scores:
