@@ -94,16 +94,17 @@ def list_command(
     fleet: str = options.FLEET,
     as_json: bool = options.JSON,
 ) -> None:
-    """List jobs of a fleet by name: state, arm, cycles, age, end and reason.
+    """List jobs of a fleet by name: state, arm, cycles, age, due date, end and reason.
 
     The age counts from the release. The end is the predicted one of a job that
-    an arm has, and the true one of a finished job.
+    an arm has, and the true one of a finished job. A job is late if it ends
+    after its due date, or waits beyond it.
     """
     import time
 
     from fleet.bus.client import BusClient, NoReply
     from fleet.bus.protocol import keys
-    from fleet.bus.protocol.auction import SETTLED, Status, StatusRequest
+    from fleet.bus.protocol.auction import ABANDONED, SETTLED, Status, StatusRequest
     from fleet.live.monitor.snapshot import FleetListener
     from scenarios.cli.options import the_fleet
     from scenarios.show.words import clock, duration
@@ -128,9 +129,12 @@ def list_command(
         is_open = job.release_s is not None and job.state not in SETTLED and now_s > job.release_s
         age = duration(now_s - (job.release_s or 0.0)) if is_open else ""
         cycles, end = f"{job.cycles} of {job.repetitions}", "" if end_s is None else clock(end_s)
-        return job.job, job.state.replace("_", " "), job.arm, cycles, age, end, job.reason
+        due = "" if job.due_s is None else clock(job.due_s)
+        late_s = 0.0 if job.due_s is None or job.state in ABANDONED else (now_s if end_s is None else end_s) - job.due_s
+        due += f", {duration(late_s)} late" if late_s > 0 else ""
+        return job.job, job.state.replace("_", " "), job.arm, cycles, age, due, end, job.reason
 
-    head = ("job", "state", "arm", "cycles", "age", "end", "reason")
+    head = ("job", "state", "arm", "cycles", "age", "due", "end", "reason")
     print_either(as_json, jobs, Table(head=head, rows=tuple(map(row, jobs)), numbers=False))
 
 

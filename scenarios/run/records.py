@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from functools import cached_property
 from itertools import zip_longest
 from math import isfinite
@@ -15,6 +16,7 @@ from fleet.events import Event
 from fleet.observation import Observation
 from fleet.robot import ThermalLimits
 from fleet.telemetry import Telemetry
+from scenarios.spec.calendar import begin_of
 
 Array = np.ndarray
 
@@ -294,6 +296,13 @@ class ShiftLog:
     jobs: tuple[JobRecord, ...] = ()
     offers: tuple[Offer, ...] = ()
     """Offers of all arms at every award."""
+
+    @cached_property
+    def begin(self) -> datetime | None:
+        """Date of the begin, in the zone of its times of day; None if it is unknown."""
+        scenario = self.card.get("scenario", {})
+        text = scenario.get("shift_begin")
+        return None if text is None else begin_of(text, scenario.get("time_zone"))
 
     @property
     def policy(self) -> str:

@@ -2,9 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass
-from datetime import UTC, datetime, timedelta
 from itertools import combinations
-from zoneinfo import ZoneInfo
 
 import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
@@ -20,6 +18,7 @@ from scenarios.prepare.fleet import ShiftFactory, cell_problems, prepare, space_
 from scenarios.prepare.load_factor import LoadFactor, load_factor
 from scenarios.progress import Progress, quiet
 from scenarios.show.words import clock, duration
+from scenarios.spec.calendar import begin_of, date_at
 from scenarios.spec.jobs import all_works, alternatives_of, fault_price, works_of
 from scenarios.spec.schema import ArmSpec, JobStream, Scenario
 from scenarios.table import Table
@@ -342,10 +341,7 @@ def _moment(scenario: Scenario, time_s: float) -> str:
     """A time of the shift; as a date where its begin is one."""
     if scenario.shift_begin is None:
         return clock(time_s)
-    begin = datetime.fromisoformat(scenario.shift_begin)
-    zone = begin.tzinfo if scenario.time_zone is None else ZoneInfo(scenario.time_zone)
-    moment = (begin.astimezone(UTC) + timedelta(seconds=time_s)).astimezone(zone)
-    return f"{moment:%a %d %b %H:%M}"
+    return f"{date_at(begin_of(scenario.shift_begin, scenario.time_zone), time_s):%a %d %b %H:%M}"
 
 
 def _absences(scenario: Scenario) -> str:

@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from functools import cache
 from importlib.util import find_spec
 from itertools import chain
@@ -107,6 +108,17 @@ class Playback:
     """Each of `packed`."""
     unit_s: float
     """Unit of the figure's time axis."""
+    begin: datetime | None = None
+    """Date of the begin, with its zone; None if it is unknown."""
+
+    @property
+    def clock(self) -> dict[str, object] | None:
+        """The begin, ms since 1970, and the name of its zone; of a zone without one, its local time as that in UTC."""
+        if self.begin is None:
+            return None
+        zone = getattr(self.begin.tzinfo, "key", None)
+        moment = self.begin if zone else self.begin.replace(tzinfo=UTC)
+        return {"ms": 1000 * moment.timestamp(), "zone": zone or "UTC"}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -146,7 +158,8 @@ class Page:
         """The scripts, and the function that begins; the replay comes first, since a figure takes longer."""
         replay = self.replay
         code = [static(name) for name in ("unpack.js", "figure.js", *(("cell.js", "replay.js") if replay else ()))]
-        play = f'await runLibrary("three");const shift=await startReplay({replay.unit_s});' if replay else ""
+        begin = f"startReplay({replay.unit_s},{json.dumps(replay.clock)})" if replay else ""
+        play = f'await runLibrary("three");const shift=await {begin};' if replay else ""
         draw = f"const figure=await drawFigures({json.dumps(_PLOTLY_OPTIONS)});" if self.charts else ""
         join = "shift.attach(figure);" if replay and self.charts else ""
         start = f'async function start(){{startFilters();{play}{draw}{join}document.body.dataset.ready="all";}}'

@@ -13,7 +13,7 @@ import numpy as np
 
 from fleet.env.render.heat import heat_scale
 from fleet.events import Event
-from scenarios.run.records import JobSpan, Offer, Schedule, ShiftLog
+from scenarios.run.records import JobSpan, Offer, ShiftLog
 from scenarios.show.page import (
     AXIS,
     LAYOUT,
@@ -58,7 +58,7 @@ def verdict(log: ShiftLog) -> Verdict:
     """
     metrics, plan, faults = log.card.get("metrics") or {}, log.plan, log.faults
     contacts = sum(event.kind == "contact" for event in log.events)
-    about = {_fault(fault, plan): fault for fault in faults[:MOST_FAULTS]}
+    about = {_fault(fault, log): fault for fault in faults[:MOST_FAULTS]}
     moments = {sentence: _before(fault) for sentence, fault in about.items()}
     sentences = [*_jobs(metrics), *_outside_shift(log.card.get("scenario") or {})]
     for sentence, fault in about.items():
@@ -119,15 +119,15 @@ def _hottest(metrics: Mapping[str, Any]) -> str:
     return f"No motor reached its fault limit; the hottest, in {arm}, reached {peaks_c[arm]:.0f} °C."
 
 
-def _fault(fault: Event, plan: Schedule) -> str:
-    outage = next((o for o in plan.outages if o.arm == fault.arm and o.start_s == fault.time_s), None)
+def _fault(fault: Event, log: ShiftLog) -> str:
+    outage = next((o for o in log.plan.outages if o.arm == fault.arm and o.start_s == fault.time_s), None)
     at = f" during {fault.job}" if fault.job else ""
     why = (fault.reason or f"joint {fault.joint} reached its limit").replace("joint ", "the motor of joint ", 1)
     loss = "and recovered at once"
     if outage is not None:
         rest = "" if outage.recovered else "the remaining "
         loss = f"out for {rest}{duration(outage.end_s - outage.start_s)}"
-    return f"{clock(fault.time_s)}: {fault.arm} stopped{at}, {loss}: {why}."
+    return f"{clock(fault.time_s, log.begin)}: {fault.arm} stopped{at}, {loss}: {why}."
 
 
 def _own_offer(award: JobSpan, log: ShiftLog) -> Offer | None:
@@ -159,17 +159,17 @@ def _cause(fault: Event, log: ShiftLog) -> Iterable[str]:
     if award is None:
         return
     begin_s = _begin(award, [a for a in plan.assignments if a.arm == fault.arm and a.start_s <= fault.time_s])
-    pause = f"at work without a pause since {clock(begin_s)}; " if begin_s < award.start_s else ""
+    pause = f"at work without a pause since {clock(begin_s, log.begin)}; " if begin_s < award.start_s else ""
     own = _own_offer(award, log)
     if own is None:
         if pause:
             yield f"Why: {pause}no prediction was recorded."
         return
     yield (
-        f"Why: {pause}at the award, {clock(award.start_s)}, predicted peak {own.peak_c:.0f} °C and P(saturation) "
-        f"{own.p_saturation:.2f}."
+        f"Why: {pause}at the award, {clock(award.start_s, log.begin)}, predicted peak {own.peak_c:.0f} °C and "
+        f"P(saturation) {own.p_saturation:.2f}."
     )
-    yield _avoidable(fault, own, log.offers_behind(award.job, award.arm, award.start_s), plan)
+    yield _avoidable(fault, own, log.offers_behind(award.job, award.arm, award.start_s), log)
 
 
 def _begin(award: JobSpan, work: Sequence[JobSpan]) -> float:
@@ -181,7 +181,7 @@ def _begin(award: JobSpan, work: Sequence[JobSpan]) -> float:
     return begin_s
 
 
-def _avoidable(fault: Event, own: Offer, offered: Sequence[Offer], plan: Schedule) -> str:
+def _avoidable(fault: Event, own: Offer, offered: Sequence[Offer], log: ShiftLog) -> str:
     """What would have avoided a fault, by the predictions at the award of its job."""
     own_c = own.peak_c or math.inf
     limit_c = _limit_c(fault)
@@ -191,23 +191,24 @@ def _avoidable(fault: Event, own: Offer, offered: Sequence[Offer], plan: Schedul
     if cooler:
         best = min(free or cooler, key=lambda o: o.peak_c or 0.0)
         choice = f"Avoidable by giving the job to {best.arm}, predicted peak {best.peak_c:.0f} °C"
-        return f"{choice}: it was free." if best.free else f"{choice}, {_occupied(best, plan)}."
+        return f"{choice}: it was free." if best.free else f"{choice}, {_occupied(best, log)}."
     others = "no other arm could do the job" + (" cooler" if any(o.feasible and not o.awarded for o in offered) else "")
     if own_c < limit_c:
         return f"Not predicted: the predicted peak was below the limit, and {others}."
     return f"Avoidable only by letting the job wait until {fault.arm} had cooled: {others}."
 
 
-def _occupied(offer: Offer, plan: Schedule) -> str:
+def _occupied(offer: Offer, log: ShiftLog) -> str:
     """Why an arm could not take a job, or until when."""
     if offer.state == "faulted":
         return "which was out after a fault"
+    plan = log.plan
     current = plan.at(offer.arm, offer.time_s)
     if current is None or current.end_s == offer.time_s:
         return "but its place or space was taken"
     if current.end_s >= plan.horizon_s:
         return "which was busy to the end"
-    return f"once it was free, at {clock(current.end_s)}"
+    return f"once it was free, at {clock(current.end_s, log.begin)}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,7 +252,7 @@ def lateness_text(log: ShiftLog, late: Sequence[LateJob]) -> str:
     over = duration(first.late_s)
     how = f"finished {over} late" if first.state == "finished" else f"is unfinished {over} after its due date"
     if first.abandoned:
-        how = f"was abandoned, due at {clock(first.due_s)}"
+        how = f"was abandoned, due at {clock(first.due_s, log.begin)}"
     if len(late) == 1:
         return f"{first.job} {how}: {_reason(log, first)}."
     counts = ((finished, "finished late"), (len(late) - finished, "unfinished at the due date"))
@@ -265,7 +266,7 @@ def _late_table(log: ShiftLog) -> Table | None:
 
     def row(each: LateJob) -> tuple[str, ...]:
         over = "" if each.abandoned else duration(each.late_s)
-        return each.job, clock(each.due_s), over, each.state.replace("_", " "), _reason(log, each)
+        return each.job, clock(each.due_s, log.begin), over, each.state.replace("_", " "), _reason(log, each)
 
     rows = tuple(map(row, late[:MOST_LATE]))
     caption = f"The first {MOST_LATE} of {len(late)}." if len(late) > MOST_LATE else ""
@@ -278,7 +279,7 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
     own = sorted((span for span in log.plan.assignments if span.job == late.job), key=lambda span: span.start_s)
     for span in own:
         if span.outcome in ("returned", "given_up"):
-            return f"{span.arm} {'faulted during' if span.faulted else 'returned'} it at {clock(span.end_s)}"
+            return f"{span.arm} {'faulted during' if span.faulted else 'returned'} it at {clock(span.end_s, log.begin)}"
     times_s = {event.kind: event.time_s for event in log.events if event.job == late.job}
     begin_s = times_s.get("release")
     if begin_s is None:
@@ -406,8 +407,8 @@ def report_html(log: ShiftLog, model: Mapping[str, Any] | None = None) -> str:
         "tiles": key_figures(card.get("metrics") or {}),
         "replay": replay is not None,
         "late": _late_table(log),
-        "events": _event_table(log.events),
-        "awards": _award_table(log.offers, log.arms),
+        "events": _event_table(log),
+        "awards": _award_table(log),
         "requests": _request_table(card.get("requests") or ()),
         "provenance": _provenance(card),
     }
@@ -424,6 +425,7 @@ def _playback(logs: Sequence[ShiftLog], model: Mapping[str, Any]) -> Playback:
         model={**model, "heat": heat_scale(limits.warning_c, limits.error_c)},
         shifts=tuple(packed(log.readings, log.load_kg) for log in logs),
         unit_s=time_unit(logs[0].plan.horizon_s)[1],
+        begin=logs[0].begin,
     )
 
 
@@ -536,9 +538,9 @@ def numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
     return values | {name: max(by_arm.values()) for name, by_arm in own.items() if by_arm}
 
 
-def _event_table(events: Sequence[Event]) -> Mapping[str, object] | None:
+def _event_table(log: ShiftLog) -> Mapping[str, object] | None:
     """The notable events by time, how many there are, and which are left out; None if there are none."""
-    notable = [e for e in events if e.kind in NOTABLE]
+    notable = [e for e in log.events if e.kind in NOTABLE]
     if not notable:
         return None
     first = sorted(notable, key=lambda e: (NOTABLE.index(e.kind), e.time_s))
@@ -549,7 +551,7 @@ def _event_table(events: Sequence[Event]) -> Mapping[str, object] | None:
     listed.sort(key=lambda e: (e.time_s, e.arm, NOTABLE.index(e.kind)))
     table = Table(
         head=("time", "event", "arm", "job", "reason"),
-        rows=tuple((clock(e.time_s), kind_text(e.kind), e.arm, e.job, e.reason) for e in listed),
+        rows=tuple((clock(e.time_s, log.begin), kind_text(e.kind), e.arm, e.job, e.reason) for e in listed),
         numbers=False,
     )
     kinds, moments = [e.kind for e in listed], [_before(event) for event in listed]
@@ -566,13 +568,10 @@ def _before(event: Event) -> Moment:
     return Moment(max(0.0, event.time_s - BEFORE_S), event.arm)
 
 
-def _award_table(offers: Sequence[Offer], arms: Sequence[str]) -> Mapping[str, object] | None:
-    """Why each arm got its job: the offers behind each award, side by side; None without offers.
-
-    Args:
-        offers: In order of time; those of one award are neighbours.
-    """
-    awards = [list(group) for _, group in groupby(offers, key=lambda o: (o.time_s, o.job))]
+def _award_table(log: ShiftLog) -> Mapping[str, object] | None:
+    """Why each arm got its job: the offers behind each award, side by side; None without offers."""
+    arms = log.arms
+    awards = [list(group) for _, group in groupby(log.offers, key=lambda o: (o.time_s, o.job))]
     if not awards:
         return None
     every_arm = len(arms) <= MOST_ARMS
@@ -589,7 +588,7 @@ def _award_table(offers: Sequence[Offer], arms: Sequence[str]) -> Mapping[str, o
             )
             cells = [offer_text(winner), *(f"{o.arm}: {offer_text(o)}" for o in others[:3])]
             cells += [""] * (4 - len(cells))
-        rows.append((clock(winner.time_s), winner.job, winner.arm, *cells))
+        rows.append((clock(winner.time_s, log.begin), winner.job, winner.arm, *cells))
         moments.append(Moment(winner.time_s, winner.arm))
     table = Table(head=head, rows=tuple(rows), numbers=False)
     left = f" The first {MOST_AWARDS} of {len(awards)} are listed; offers.parquet has all of them."
@@ -634,7 +633,9 @@ def other_choices(log: ShiftLog, other: ShiftLog) -> list[str]:
         finish = next((event for event in own if event.kind == "finish"), None)
         if finish is not None:
             after = f", after {len(faults)} fault{'s' * (len(faults) > 1)}" if faults else " without a fault"
-            lines.append(f"Under {other.policy}, {finish.arm} finished {job} at {clock(finish.time_s)}{after}.")
+            lines.append(
+                f"Under {other.policy}, {finish.arm} finished {job} at {clock(finish.time_s, other.begin)}{after}."
+            )
         else:
             began = any(event.kind == "award" for event in own)
             lines.append(f"Under {other.policy}, {job} was not {'finished' if began else 'begun'}.")

@@ -5,6 +5,7 @@ The figures are plain dicts in Plotly's schema, because Plotly's own objects tak
 
 import base64
 from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
 from itertools import cycle
 from typing import Any, TypeVar  # Any: values of Plotly's schema
 
@@ -17,7 +18,7 @@ from fleet.telemetry import Telemetry
 from scenarios.run.records import JobSpan, Outage, ShiftLog
 from scenarios.show import page
 from scenarios.show.page import AXIS, INK, axis, plain
-from scenarios.show.words import clock
+from scenarios.show.words import clock, duration
 
 Array = np.ndarray
 Trace = dict[str, Any]
@@ -99,7 +100,7 @@ def figure(log: ShiftLog) -> dict[str, Any]:
     overview = len(lanes) < len(arms)
     time = AXIS | {
         "range": [0, max(plan.horizon_s / unit_s, 1e-3)],
-        "title": {"text": f"time ({unit})", "standoff": 6},
+        "title": {"text": _time_title(log, unit), "standoff": 6},
         "domain": [0, 1],
     }
     layout = LAYOUT | _blocks(arms, lanes, _legend_height(bars))
@@ -143,7 +144,7 @@ def hottest_motors(logs: Mapping[str, ShiftLog]) -> dict[str, Any]:
         trace = _curve(plain(name, STREAM_NAME), log.readings.time_s[kept] / unit_s, values[-1][kept], line, hover)
         traces.append(trace | {"customdata": texts})
     shapes, labels = _limit_lines(first.limits, "y")
-    time = axis(f"time ({unit})", range=[0, first.plan.horizon_s / unit_s])
+    time = axis(_time_title(first, unit), range=[0, first.plan.horizon_s / unit_s])
     temperature = axis("hottest motor, °C", range=_range_c(np.concatenate(values), first.limits))
     return {
         "data": traces,
@@ -193,7 +194,7 @@ def _gantt(log: ShiftLog, unit_s: float) -> list[Trace]:
     ):
         if spans:
             look = {"color": colour, "opacity": 0.8, "line": {"width": 0}, "pattern": HATCH | {"shape": shape}}
-            bars = _bars(name, spans, _outage_text, arms, unit_s, look)
+            bars = _bars(name, spans, _outage_text, log, unit_s, look)
             traces.append(bars | ({"width": BREAK_HEIGHT} if name == "break" else {}))
     if not traces:  # without a trace Plotly draws no rows
         traces.append(_legend_entry("no job was begun", {}) | {"showlegend": True})
@@ -206,7 +207,7 @@ def _gantt(log: ShiftLog, unit_s: float) -> list[Trace]:
                 "y": [arms.index(e.arm) - 0.42 for e in marked],
             }
             trace = {"type": "scatter", "mode": "markers", "name": kind, "marker": look, "legend": "legend"}
-            traces.append(trace | at | _hover([_event_text(e) for e in marked]))
+            traces.append(trace | at | _hover([_event_text(e, log.begin) for e in marked]))
     return traces
 
 
@@ -239,7 +240,7 @@ def _work_bars(log: ShiftLog, unit_s: float) -> list[Trace]:
             # For people who see no colours and for dark pages, which show no dark outline.
             "pattern": HATCH | {"shape": ["/" if a.outcome == "returned" else "." if a.late_s else "" for a in own]},
         }
-        traces.append(_bars(plain(stream, STREAM_NAME), own, _assignment_text, log.arms, unit_s, look))
+        traces.append(_bars(plain(stream, STREAM_NAME), own, _assignment_text, log, unit_s, look))
     outcomes = {a.outcome for a in assignments}
     samples = (
         ("late", any(a.late_s for a in assignments), {"line": LATE, "pattern": HATCH | {"shape": "."}}),
@@ -255,17 +256,22 @@ def _legend_entry(name: str, look: Trace) -> Trace:
 
 
 def _bars(
-    name: str, spans: Sequence[Span], text: Callable[[Span], str], arms: Sequence[str], unit_s: float, look: Trace
+    name: str,
+    spans: Sequence[Span],
+    text: Callable[[Span, datetime | None], str],
+    log: ShiftLog,
+    unit_s: float,
+    look: Trace,
 ) -> Trace:
     """Horizontal bars of assignments or outages."""
     return BAR | {
         "name": name,
-        "y": [arms.index(span.arm) for span in spans],
+        "y": [log.arms.index(span.arm) for span in spans],
         "base": [round(span.start_s / unit_s, 5) for span in spans],
         "x": [round((span.end_s - span.start_s) / unit_s, 5) for span in spans],
         "width": BAR_HEIGHT,
         "marker": look,
-        **_hover([text(span) for span in spans]),
+        **_hover([text(span, log.begin) for span in spans]),
     }
 
 
@@ -273,11 +279,11 @@ def _hover(texts: list[str]) -> Trace:
     return {"customdata": texts, "hovertemplate": "%{customdata}<extra></extra>"}
 
 
-def _assignment_text(a: JobSpan) -> str:
+def _assignment_text(a: JobSpan, begin: datetime | None) -> str:
     """Hover text of one assignment."""
     if a.outcome == "finished":
-        end = "on time" if not a.late_s else f"late by {clock(a.late_s)}"
-        end = f"finished at {clock(a.finished_s or 0.0)}, {end}"
+        end = "on time" if not a.late_s else f"late by {duration(a.late_s)}"
+        end = f"finished at {clock(a.finished_s or 0.0, begin)}, {end}"
     elif a.outcome == "returned":
         kept = "" if a.cycles_kept is None else f", {a.cycles_kept} cycles kept"
         end = f"returned to the queue{' after a fault' if a.faulted else ''}{kept}"
@@ -285,22 +291,29 @@ def _assignment_text(a: JobSpan) -> str:
         end = "still running at the end"
     scores = [a.prediction] if a.prediction else []
     scores += [f"difficulty {a.difficulty:.3g}"] if np.isfinite(a.difficulty) else []
-    lines = [f"<b>{plain(a.job)}</b> on {plain(a.arm)}", f"{clock(a.start_s)} – {clock(a.end_s)}", end, *scores]
+    lines = [
+        f"<b>{plain(a.job)}</b> on {plain(a.arm)}",
+        f"{clock(a.start_s, begin)} – {clock(a.end_s, begin)}",
+        end,
+        *scores,
+    ]
     return "<br>".join(lines)
 
 
-def _outage_text(o: Outage) -> str:
+def _outage_text(o: Outage, begin: datetime | None) -> str:
     """Hover text of one outage or break."""
     if o.kind == "break":
-        return f"<b>{plain(o.arm)} has a break</b><br>{clock(o.start_s)} – {clock(o.end_s)}"
+        return f"<b>{plain(o.arm)} has a break</b><br>{clock(o.start_s, begin)} – {clock(o.end_s, begin)}"
     end = "recovered" if o.recovered else "not recovered"
-    return f"<b>{plain(o.arm)} lost</b><br>{clock(o.start_s)} – {clock(o.end_s)}, {end}<br>{plain(o.reason)}"
+    return (
+        f"<b>{plain(o.arm)} lost</b><br>{clock(o.start_s, begin)} – {clock(o.end_s, begin)}, {end}<br>{plain(o.reason)}"
+    )
 
 
-def _event_text(e: Event) -> str:
+def _event_text(e: Event, begin: datetime | None) -> str:
     """Hover text of one event."""
     job = f"<br>{plain(e.job)}" if e.job else ""
-    return f"<b>{e.kind}</b> of {plain(e.arm)} at {clock(e.time_s)}<br>{plain(e.reason)}{job}"
+    return f"<b>{e.kind}</b> of {plain(e.arm)} at {clock(e.time_s, begin)}<br>{plain(e.reason)}{job}"
 
 
 def _lanes(telemetry: Telemetry, arms: int) -> list[int]:
@@ -356,6 +369,11 @@ def _heat_map(log: ShiftLog, lane: int, unit: str, unit_s: float) -> Trace:
 def time_unit(horizon_s: float) -> tuple[str, float]:
     """Time unit of the axes and its length in s: minutes up to three hours, else hours."""
     return ("min", 60.0) if horizon_s <= 3 * 3600 else ("h", 3600.0)
+
+
+def _time_title(log: ShiftLog, unit: str) -> str:
+    """Title of an axis of time, which counts from the begin of the shift."""
+    return f"time ({unit})" if log.begin is None else f"time since {log.begin:%a %d %b %H:%M} ({unit})"
 
 
 def _blocks(arms: Sequence[str], lanes: Sequence[int], legend_px: float) -> dict[str, Any]:

@@ -1,9 +1,11 @@
 """Times, events and offers in words."""
 
 from collections.abc import Mapping, Sequence
+from datetime import datetime
 from typing import TYPE_CHECKING
 
 from fleet.events import Event
+from scenarios.spec.calendar import date_at
 
 if TYPE_CHECKING:  # slow to import
     from scenarios.run.records import Offer
@@ -18,8 +20,11 @@ MOST_NAMES = 6
 LABELS = {"lost": "claim lost", "return": "job returned", "recover": "recovered"}
 
 
-def clock(time_s: float) -> str:
-    """A time of the shift as h:mm:ss."""
+def clock(time_s: float, begin: datetime | None = None) -> str:
+    """A time of the shift as h:mm:ss; with its begin, which has a zone, the time of day, on later days with the day."""
+    if begin is not None:
+        moment = date_at(begin, time_s)
+        return f"{moment:%H:%M:%S}" if moment.date() == begin.date() else f"{moment:%a %d %b %H:%M:%S}"
     seconds = round(time_s)
     return f"{seconds // 3600}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
 

@@ -7,7 +7,7 @@ arrivals of kind `weekly`. They become plain times here, so the rest of the prod
 
 import re
 from collections.abc import Iterator, Mapping
-from datetime import datetime, time, timedelta, tzinfo
+from datetime import UTC, datetime, time, timedelta, tzinfo
 from math import ceil
 from typing import Any
 from zoneinfo import ZoneInfo
@@ -47,6 +47,17 @@ def zone_of(name: object, where: str) -> tzinfo | None:
         ) from error
 
 
+def begin_of(shift_begin: str, time_zone: str | None) -> datetime:
+    """The begin of the shift of a `Scenario`, in the zone of its times of day."""
+    begin = datetime.fromisoformat(shift_begin)
+    return begin if time_zone is None else begin.astimezone(ZoneInfo(time_zone))
+
+
+def date_at(begin: datetime, time_s: float) -> datetime:
+    """The date of a time of the shift, to the second, in the zone of its begin."""
+    return (begin.astimezone(UTC) + timedelta(seconds=round(time_s))).astimezone(begin.tzinfo)
+
+
 def with_calendar(raw: Mapping[str, Any], begin: datetime | None, horizon_s: float, file: str) -> dict[str, Any]:
     """The parsed file with the times of its breaks and recurring jobs in seconds; Any: values of TOML.
 
@@ -59,7 +70,7 @@ def with_calendar(raw: Mapping[str, Any], begin: datetime | None, horizon_s: flo
     """
     made = dict(raw)
     if not horizon_s:
-        return made
+        return made | ({"breaks": []} if "breaks" in made else {})
     if isinstance(breaks := raw.get("breaks"), list):
         made["breaks"] = [
             entry
@@ -83,23 +94,28 @@ def _break_times(
         return
     if missing := [name for name in ("begin", "end") if name not in given]:
         raise ScenarioError(f"{where}: '{missing[0]}' is missing; a break has begin and end.")
-    if "weekdays" in given:
-        first, last = (_clock(given[name], f"{where}.{name}") for name in ("begin", "end"))
-        for day_s, date in _days(given["weekdays"], begin, horizon_s, f"{where}.weekdays"):
-            begin_s, end_s = day_s(date, first), day_s(date + timedelta(days=last <= first), last)
-            if end_s > 0 and begin_s < horizon_s:
-                yield entry | {"begin_s": begin_s, "end_s": end_s}
+    daily = begin is not None and all(_is_clock(given[name]) for name in ("begin", "end"))
+    if "weekdays" not in given and not daily:
+        try:
+            first_s, last_s = (seconds_of(given[name], begin, horizon_s) for name in ("begin", "end"))
+        except ValueError as error:
+            raise ScenarioError(f"{where}: {error}.") from error
+        yield entry | {"begin_s": first_s, "end_s": last_s}
         return
-    try:
-        first_s, last_s = (seconds_of(given[name], begin, horizon_s) for name in ("begin", "end"))
-    except ValueError as error:
-        raise ScenarioError(f"{where}: {error}.") from error
-    is_clock = isinstance(given["end"], time) or re.fullmatch(r"\d{1,2}:\d{2}(:\d{2})?", str(given["end"]))
-    if last_s < first_s and begin is not None and is_clock:
-        if last_s + DAY_S - first_s > LONGEST_NIGHT_S:
-            raise ScenarioError(f"{where}: it ends at {given['end']}, before it begins at {given['begin']}.")
-        last_s += DAY_S
-    yield entry | {"begin_s": first_s, "end_s": last_s}
+    first, last = (_clock(given[name], f"{where}.{name}") for name in ("begin", "end"))
+    if last <= first and (_since_midnight_s(last) + DAY_S - _since_midnight_s(first)) > LONGEST_NIGHT_S:
+        raise ScenarioError(f"{where}: it ends at {given['end']}, before it begins at {given['begin']}.")
+    found = list[dict[str, Any]]()
+    for day_s, date in _days(given.get("weekdays", list(WEEKDAYS)), begin, horizon_s, f"{where}.weekdays"):
+        begin_s, end_s = day_s(date, first), day_s(date + timedelta(days=last <= first), last)
+        if end_s > 0 and begin_s < horizon_s:
+            found.append(entry | {"begin_s": begin_s, "end_s": end_s})
+    if not found and "weekdays" not in given:
+        raise ScenarioError(
+            f"{where}: {given['begin']} to {given['end']} is outside the shift, which begins at {begin:%H:%M} and ends "
+            f"{horizon_s / 3600.0:.3g} h later."
+        )
+    yield from found if "weekdays" in given else found[:1]
 
 
 def _recurring(stream: Any, begin: datetime | None, horizon_s: float, where: str) -> Any:
@@ -143,10 +159,21 @@ def _days(given: object, begin: datetime | None, horizon_s: float, where: str) -
             yield since_begin, date
 
 
+def _is_clock(given: object) -> bool:
+    """Whether a value is written as a time of day."""
+    return isinstance(given, time) or re.fullmatch(r"\d{1,2}:\d{2}(:\d{2})?", str(given)) is not None
+
+
+def _since_midnight_s(clock: time) -> float:
+    return clock.hour * 3600.0 + clock.minute * 60.0 + clock.second
+
+
 def _clock(given: object, where: str) -> time:
-    """A time of day."""
+    """A time of day; 24:00 is 0:00 of the next."""
     if isinstance(given, time):
         return given
+    if str(given) in ("24:00", "24:00:00"):
+        return time()
     try:
         hours, _, rest = str(given).partition(":")
         return time.fromisoformat(f"{hours:0>2}:{rest}")
@@ -168,11 +195,20 @@ def check_breaks(scenario: Scenario, file: str) -> None:
             if name not in arms:
                 raise ScenarioError(f"{file}: breaks[{i}].arms: there is no arm '{name}'{nearest(name, arms)}")
         if each.end_s <= 0 or each.begin_s >= scenario.horizon_s:
-            begin = f", which begins at {scenario.shift_begin}" if scenario.shift_begin else ""
+            times_s = ((each.begin_s, each.end_s), (0.0, scenario.horizon_s))
+            own, shift = (_span_text(scenario, *both) for both in times_s)
             raise ScenarioError(
-                f"{file}: breaks[{i}]: '{each.name}', {each.begin_s:g} to {each.end_s:g} s, lies outside the shift of "
-                f"{scenario.horizon_s:g} s{begin}: change its times, or leave it out."
+                f"{file}: breaks[{i}]: '{each.name}', {own}, lies outside the shift, {shift}: change its times, or "
+                "leave it out."
             )
+
+
+def _span_text(scenario: Scenario, begin_s: float, end_s: float) -> str:
+    """From when to when: dates if the begin of the shift is one, else seconds."""
+    if scenario.shift_begin is None:
+        return f"{begin_s:g} to {end_s:g} s"
+    begin = begin_of(scenario.shift_begin, scenario.time_zone)
+    return " to ".join(f"{date_at(begin, time_s):%d %b %Y %H:%M}" for time_s in (begin_s, end_s))
 
 
 def absences_of(scenario: Scenario, seed: np.random.SeedSequence) -> np.ndarray:

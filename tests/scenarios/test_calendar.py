@@ -12,7 +12,8 @@ from scenarios.prepare.batch import make_batch
 from scenarios.prepare.fleet import make_env, prepare
 from scenarios.run.shift import run
 from scenarios.show.run_page import report_html
-from scenarios.spec.calendar import absences_of
+from scenarios.show.words import clock
+from scenarios.spec.calendar import absences_of, begin_of
 from scenarios.spec.options import RunSpec
 from scenarios.spec.parse import parse_scenario
 from scenarios.spec.schema import Failures, Scenario
@@ -73,6 +74,21 @@ def test_a_daily_night_break_covers_the_begin_of_the_shift() -> None:
     assert found == [(-7.0, 1.0), (17.0, 25.0)]
 
 
+def test_a_break_without_weekdays_is_the_first_that_touches_the_shift() -> None:
+    begin = {"shift_begin": "2026-03-28T20:00", "time_zone": "Europe/Berlin", "horizon_s": 30 * HOUR_S}
+    entries = [("19:30", "20:30"), ("19:00", "20:00"), ("23:00", "24:00")]
+    found = hours(with_breaks(*({"name": a, "begin": a, "end": b} for a, b in entries), **begin))
+    assert found == [(-0.5, 0.5), (22.0, 23.0), (3.0, 4.0)]
+
+
+def test_times_of_a_shift_are_times_of_day_with_summer_time() -> None:
+    begin = begin_of("2026-03-28T20:00+01:00", "Europe/Berlin")
+    assert [clock(hours_in * HOUR_S, begin) for hours_in in (0.0, 3.9, 5.0, 6.5)] == [
+        "20:00:00", "23:54:00", "Sun 29 Mar 01:00:00", "Sun 29 Mar 03:30:00",
+    ]  # fmt: skip
+    assert clock(6.5 * HOUR_S) == "6:30:00"
+
+
 def test_recurring_jobs_arrive_at_their_times_of_day() -> None:
     raw = small() | {"horizon_s": 48 * HOUR_S, "shift_begin": "2026-03-27T20:00", "time_zone": "Europe/Berlin"}
     stream = raw["jobs"][0] | {"arrivals": {"kind": "weekly", "at": ["14:30", "6:00"], "weekdays": ["sunday"]}}
@@ -97,8 +113,18 @@ BREAK = {"name": "lunch", "begin": "4:00", "end": "5:00"}
         ({"breaks": [BREAK | {"weekdays": ["sunday"]}]}, r"weekdays need shift_begin, the begin of the shift"),
         (
             {"breaks": [BREAK, BREAK | {"name": "late", "begin": "90:00", "end": "91:00"}]},
-            r"breaks\[1\]: 'late', 324000 to 327600 s, lies outside the shift of 172800 s: change its times",
+            r"breaks\[1\]: 'late', 324000 to 327600 s, lies outside the shift, 0 to 172800 s: change its times",
         ),
+        (
+            {"breaks": [BREAK | {"begin": "2026-11-30T10:00", "end": "2026-11-30T11:00"}],
+             "shift_begin": "2026-11-23T06:00Z"},
+            "30 Nov 2026 10:00 to 30 Nov 2026 11:00, lies outside the shift, 23 Nov 2026 06:00 to 25 Nov 2026 06:00:",
+        ),
+        (
+            {"breaks": [BREAK], "shift_begin": "2026-11-23T06:00Z", "horizon_s": 12 * HOUR_S},
+            "4:00 to 5:00 is outside the shift, which begins at 06:00 and ends 12 h later",
+        ),
+        ({"breaks": [BREAK], "horizon_s": 0}, "horizon_s must be"),
         ({"breaks": [BREAK | {"begin": "11.30"}]}, r"breaks\[0\]: is this 11:30\? Give times as h:mm"),
         (
             {"breaks": [BREAK | {"begin": "11:30", "end": "11:00"}], "shift_begin": "2026-11-23T06:00Z"},

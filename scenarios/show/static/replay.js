@@ -30,8 +30,8 @@ function stateAt(array, row, timeS) {
   return array.values[row * array.moments + i] * array.scale;
 }
 
-// Plays the shifts; a figure that is drawn later gets its cursor by `attach`.
-async function startReplay(unitS) {
+// Plays the shifts; a figure that is drawn later gets its cursor by `attach`. `begin`: as `Playback.clock`, or null.
+async function startReplay(unitS, begin) {
   const model = JSON.parse(document.getElementById("cell-model").textContent);
   const shifts = await Promise.all([...document.querySelectorAll(".replay .cell")].map(async (place, i) =>
     ({ place, now: place.nextElementSibling, data: await readPlayback(`playback-${i}`), cell: null, modes: null })));
@@ -50,12 +50,13 @@ async function startReplay(unitS) {
   slider.max = endS;
   slider.step = "any";
   const radius = (kg) => Math.min(model.load.most_m, Math.cbrt((3 * kg) / (4 * Math.PI * model.load.kg_per_m3)));
+  const day = begin && new Intl.DateTimeFormat("en-GB", { timeZone: begin.zone, weekday: "short", hour: "2-digit", minute: "2-digit", second: "2-digit" });
   const words = ["idle", "working", "faulted"];
 
   function show(t) {
     timeS = Math.min(endS, Math.max(beginS, t));
     slider.value = timeS;
-    const s = Math.round(timeS), text = `${Math.floor(s / 3600)}:${String(Math.floor(s / 60) % 60).padStart(2, "0")}:${String(s % 60).padStart(2, "0")}`;
+    const s = Math.round(timeS), text = day ? day.format(begin.ms + 1000 * s) : `${Math.floor(s / 3600)}:${String(Math.floor(s / 60) % 60).padStart(2, "0")}:${String(s % 60).padStart(2, "0")}`;
     clock.textContent = text;
     slider.setAttribute("aria-valuetext", text);
     shifts.forEach(showShift);
