@@ -1,7 +1,7 @@
 """Commands of the digital twin: `thermofleet twin …`."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, replace
 from functools import partial
@@ -13,7 +13,7 @@ import typer
 from fleet.errors import FleetError
 from fleet.fields import MAX_SEED, argument, option
 from fleet.job import BOUNDS
-from fleet.robot import POSTURES
+from fleet.robot import POSTURES, RATING
 from scenarios.cli import options
 from scenarios.cli.options import From, Given
 from scenarios.result_folder import check_file, check_free, check_overwrite, new_file, new_folder
@@ -22,6 +22,10 @@ from scenarios.terminal import echo, out_console, print_json, print_wide, progre
 from twin.vae.config import TwinConfig
 
 if TYPE_CHECKING:
+    from fleet.job import Fixture
+    from fleet.robot import Robot
+    from scenarios.motion.recover import KnownArm
+    from scenarios.progress import Progress
     from twin.logs.recording import Recording
     from twin.thermal.identify import Identified
     from twin.vae.twin import Twin
@@ -168,8 +172,36 @@ def one_of(recordings: "list[Recording]", path: Path) -> "Recording":
     return recordings[0]
 
 
+_LOGGED = "An arm known by its logs: no scenario, but --twins and --network"
+TILT = option("Roll, pitch, yaw of its base, degrees; 0,0,0 stands on the floor.", "0,0,0", panel=_LOGGED)
+TOOL = option("Mass of its tool, kg.", 0.0, low=0, high=RATING.temporary_kg, panel=_LOGGED)
+SCENARIO_OR_LOGGED = argument("A library name (see `thermofleet show`) or a .toml file; none for an arm of logs.", None)
+
+
+def subject_of(
+    scenario: str | None, arm: str | None, twins: Path | None, network: Path | None, tilt: str, tool_kg: float
+) -> "tuple[Robot, Sequence[Fixture], Callable[[Progress], KnownArm]]":
+    """An arm of a scenario or of logs, the fixtures around it, and how to make what is known of it."""
+    from scenarios.motion.recover import known_arm, logged_arm
+    from scenarios.prepare.twins import open_twin
+    from scenarios.spec.load import load
+
+    identified = network_of(network)
+    if scenario is None:
+        if twins is None or identified is None:
+            raise FleetError("Give a SCENARIO, or --twins and --network of an arm that is known by its logs.")
+        logged = logged_arm(open_twin(twins, arm), identified, tilt, tool_kg)
+        return logged.arm.robot, (), lambda progress: logged
+    if tilt != "0,0,0" or tool_kg:
+        raise FleetError("--tilt and --tool are for an arm without a scenario; a scenario states them.")
+    chosen = load(scenario)
+    spec = chosen.arms[0 if arm is None else chosen.index_of(arm)]
+    models = {"twin": twin_of(twins, spec.name), "network": identified}
+    return spec.robot(), chosen.fixtures, lambda progress: known_arm(chosen, spec.name, **models, progress=progress)
+
+
 def generate_command(
-    scenario: str = options.SCENARIO,
+    scenario: str | None = SCENARIO_OR_LOGGED,
     out: Path = option("Folder of the motions and generated.json.", Path("runs/generated")),
     arm: str | None = options.SCENARIO_ARM,
     twins: Path | None = KNOWN_TWINS,
@@ -178,6 +210,13 @@ def generate_command(
     strength: float = option(
         "Perturbation in posterior standard deviations; 0 reconstructs.", 1.0, flag="--s", low=0, high=100
     ),
+    posture: list[str] | None = option(
+        "A stop of the known motion, at least twice: a name, or seven angles in degrees. Default: the scenario's jobs.",
+        None,
+    ),
+    payload: float = option("--posture: payload, kg.", 0.0, low=0, high=RATING.temporary_kg),
+    tilt: str = TILT,
+    tool: float = TOOL,
     seed: int = SEED,
     overwrite: bool = options.OVERWRITE,
     as_json: bool = options.JSON,
@@ -186,18 +225,20 @@ def generate_command(
 
     Takes about 20 s once the arm's twin is in the cache.
     """
+    from fleet.arm.model import ArmModel
     from scenarios.motion.generate import generate
-    from scenarios.motion.recover import GENERATED, generated_summary, known_arm, save_generated
-    from scenarios.spec.load import load
+    from scenarios.motion.recover import GENERATED, generated_summary, motion_through, save_generated
 
-    chosen = load(scenario)
+    robot, fixtures, make_known = subject_of(scenario, arm, twins, network, tilt, tool)
+    if scenario is None and not posture:
+        raise FleetError("Without a SCENARIO no motion is known: give --posture at least twice.")
+    sources = motion_through(ArmModel(robot, fixtures), posture, payload) if posture else None
     check_free(out, GENERATED, overwrite=overwrite)
     with progress_bar() as progress:
-        models = {"twin": twin_of(twins, arm or chosen.arms[0].name), "network": network_of(network)}
-        known = known_arm(chosen, arm, **models, progress=progress)
-        how: Any = {"verification": known.verification, "fixtures": chosen.fixtures, "seed": seed}
+        known = make_known(progress)
+        how: Any = {"verification": known.verification, "fixtures": fixtures, "seed": seed}
         how |= {"s": strength, "count": count, "progress": partial(progress, "generating")}
-        made = generate(known.twin, known.arm, known.sources, **how)
+        made = generate(known.twin, known.arm, sources or known.sources, **how)
     save_generated(made, out, overwrite=overwrite)
     if as_json:
         print_json({"out": str(out), **generated_summary(made)})
@@ -210,7 +251,7 @@ def generate_command(
 
 
 def recover_command(
-    scenario: str = options.SCENARIO,
+    scenario: str | None = SCENARIO_OR_LOGGED,
     out: Path = option("Folder of the temperatures and recovery.json.", Path("runs/recovery")),
     arm: str | None = options.SCENARIO_ARM,
     twins: Path | None = KNOWN_TWINS,
@@ -221,6 +262,8 @@ def recover_command(
     hold_s: float = option(
         "Remaining time to hold, s.", 600.0, flag="--hold", low=0, high=BOUNDS["dwell_s"].high, above=True
     ),
+    tilt: str = TILT,
+    tool: float = TOOL,
     seed: int = SEED,
     overwrite: bool = options.OVERWRITE,
     as_json: bool = options.JSON,
@@ -231,20 +274,17 @@ def recover_command(
     """
     from fleet.arm.model import ArmModel
     from scenarios.motion import recover
-    from scenarios.spec.load import load
 
-    chosen = load(scenario)
-    spec = chosen.arms[0 if arm is None else chosen.index_of(arm)]
-    model = ArmModel(spec.robot())
+    robot, fixtures, make_known = subject_of(scenario, arm, twins, network, tilt, tool)
+    model = ArmModel(robot)
     q = recover.parse_posture(posture, model.position_range)
     check_free(out, recover.RECOVERY, overwrite=overwrite)
     recover.check_hold(model, q, payload, hold_s, recover.Nearby())  # before the training
     with progress_bar() as progress:
-        models = {"twin": twin_of(twins, spec.name), "network": network_of(network)}
-        known = recover.known_arm(chosen, spec.name, **models, progress=progress)
+        known = make_known(progress)
         progress("recovering", 0.0)
         start_c = recover.hold_until(known.arm, q, payload, ambient_c=known.verification.ambient_c, until_c=warm)
-        how: Any = {"verification": known.verification, "fixtures": chosen.fixtures, "seed": seed}
+        how: Any = {"verification": known.verification, "fixtures": fixtures, "seed": seed}
         found = recover.recover(known.twin, known.arm, q, payload, start_c=start_c, hold_s=hold_s, **how)
     recover.save_recovery(found, out, overwrite=overwrite)
     if as_json:

@@ -263,7 +263,7 @@ def generate(
         reasons = ", ".join(f"{reason} {times}" for reason, times in rejected.most_common())
         raise GenerationError(
             f"None of {rejected.total()} motions of arm '{arm.robot.name}' passed ({reasons}). Lower s (got {s:g}), "
-            "give lighter source motions, or raise cool_c."
+            "give source motions that are lighter or farther from the joint stops, or raise cool_c."
         )
     return Generated(arm.robot.name, twin.version, s, seed, count, verification, tuple(motions), dict(rejected))
 

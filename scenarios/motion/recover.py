@@ -44,7 +44,7 @@ from fleet.heat.thermal import (
 )
 from fleet.job import BOUNDS, Fixture
 from fleet.motion import RATE_HZ, Plan, static_drive
-from fleet.robot import JOINTS, POSTURES
+from fleet.robot import JOINTS, POSTURES, Mount, Robot
 from scenarios.motion.generate import Generated, Performance, Verification, bare_arm, perform
 from scenarios.prepare.arms import plan_arms
 from scenarios.prepare.twins import require_cool_plans, train_twins
@@ -61,6 +61,8 @@ Array = np.ndarray
 
 INSTANT_S = 0.02
 """Duration of the first stop, one sample: the payload is grasped at its end, then the observation begins."""
+STOP_S = 1.0
+"""Standstill at each posture of a motion that postures describe."""
 BEST = 10
 """Number of candidates with a second search around them."""
 ROUNDS = 3
@@ -540,6 +542,40 @@ def known_arm(
         model = network.heat_model
         verification = replace(verification, motors=model.motors, thermal=model.thermal())
     return KnownArm(bare_arm(robot, motors, thermal), twin, sources, verification)
+
+
+def logged_arm(twin: Twin, network: Identified, tilt_deg: str, tool_kg: float) -> KnownArm:
+    """An arm that is known by its logs: simulated with the thermal network that they gave, without known motions.
+
+    Args:
+        tilt_deg: Roll, pitch and yaw of its base, degrees, with commas between them.
+
+    Raises:
+        FleetError: the tilt or the mass of the tool is out of range.
+    """
+    try:
+        roll, pitch, yaw = (float(part) for part in tilt_deg.split(","))
+        robot = Robot(name=twin.arm, mount=Mount(tilt_deg=(roll, pitch, yaw)), tool_kg=tool_kg)
+    except ValueError as error:
+        raise FleetError(f"The tilt is three angles in degrees, as 0,90,0 (got '{tilt_deg}': {error}).") from error
+    model = network.heat_model
+    verification = Verification(motors=model.motors, thermal=model.thermal(), ambient_c=network.ambient_c)
+    return KnownArm(bare_arm(robot, model.motors, model.thermal()), twin, (), verification)
+
+
+def motion_through(model: ArmModel, postures: Sequence[str], payload_kg: float) -> tuple[Plan, ...]:
+    """The motion from posture to posture and back, each a name or seven angles in degrees.
+
+    Raises:
+        FleetError: a posture cannot be read, there is only one, or the motion is not possible.
+    """
+    if len(postures) < 2:
+        raise FleetError(f"A motion has at least two postures (got {len(postures)}). Give --posture again.")
+    stops = np.stack([parse_posture(each, model.position_range) for each in postures])
+    try:
+        return (plan_motion(model, stops, dwell_s=STOP_S, payload_kg=payload_kg, speed=Nearby().speed),)
+    except InfeasibleJob as error:
+        raise FleetError(f"The motion through {', '.join(postures)} is not possible: {error.reason}.") from error
 
 
 GENERATED = ResultKind(name="generation", card="generated.json", files=("generated.json", "motion_*.parquet"))

@@ -496,7 +496,13 @@ def _xlsx_rows(content: bytes, where: str) -> Rows:
                     f"{where}, cell {cell.coordinate}: a formula without a stored value. Open and save the file in a "
                     "spreadsheet, or give the value."
                 )
-    yield from enumerate(sheet.iter_rows(values_only=True), start=1)
+    yield from enumerate(([_as_shown(cell) for cell in row] for row in sheet.iter_rows()), start=1)
+
+
+def _as_shown(cell: Any) -> Cell:
+    """The value of a cell of a sheet; a whole number with leading zeros, such as the name 0012, as a text."""
+    zeros = re.fullmatch("00+", str(cell.number_format)) and isinstance(cell.value, int)
+    return f"{cell.value:0{len(cell.number_format)}d}" if zeros else cell.value
 
 
 def stream_fields(job: JobSpec, horizon_s: float, row: str) -> dict[str, object]:

@@ -1,5 +1,6 @@
 """Fixtures of a scenario file whose shape is in a file of its own: STL, OBJ, GLB, MJCF or URDF."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any  # a mesh of trimesh
@@ -15,6 +16,10 @@ from scenarios.spec.schema import Scenario
 UNITS = {"m": 1.0, "mm": 0.001}
 MESHES, MODELS = (".stl", ".obj", ".glb"), (".xml", ".mjcf", ".urdf")
 MOST_BYTES, MOST_TRIANGLES, MOST_PARTS = 64_000_000, 100_000, 64
+MOST_LINE, MOST_HEAD = 10_000, 4_000_000
+"""Bytes of a line of OBJ, which holds one polygon, and of the description at the begin of a GLB file."""
+MADE = re.compile(rb"<\s*(replicate|composite|flexcomp)\b")
+"""Elements of MJCF that make any number of shapes."""
 DIGITS = 6
 """Decimal places of points, m; equal ones are one point, as the triangles of an STL file do not share theirs."""
 FLAT_M = 1e-4
@@ -76,6 +81,7 @@ def _read(file: Path, where: str) -> Any:
         raise ScenarioError(f"{where}: there is no such file. Paths are relative to the scenario file.")
     if (size := file.stat().st_size) > MOST_BYTES:
         raise ScenarioError(f"{where} has {size / 1e6:.0f} MB; at most {MOST_BYTES / 1e6:.0f} are allowed.")
+    _check_content(file.read_bytes(), ending, where)
     try:
         mesh: Any = model_solid(file) if ending in MODELS else trimesh.load_scene(file, process=False).to_mesh()
     except Exception as error:  # readers of damaged files raise errors of many kinds
@@ -88,6 +94,16 @@ def _read(file: Path, where: str) -> Any:
     if ending == ".glb":  # there y points up
         mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
     return mesh
+
+
+def _check_content(content: bytes, ending: str, where: str) -> None:
+    """Refuse what takes a reader minutes or gigabytes though the file is small."""
+    if ending in MODELS and (made := MADE.search(content)):
+        raise ScenarioError(f"{where} has <{made[1].decode()}>, which makes shapes. Write them out, or give a mesh.")
+    if ending == ".obj" and (longest := max(map(len, content.split(b"\n")))) > MOST_LINE:
+        raise ScenarioError(f"{where} has a line of {longest} bytes; at most {MOST_LINE} are allowed. Use triangles.")
+    if ending == ".glb" and (head := int.from_bytes(content[12:16], "little")) > MOST_HEAD:
+        raise ScenarioError(f"{where} describes its parts in {head} bytes; at most {MOST_HEAD} are allowed. Join them.")
 
 
 def _convex_parts(mesh: Any, where: str) -> list[np.ndarray]:

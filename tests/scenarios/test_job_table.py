@@ -189,6 +189,11 @@ def test_parquet_and_xlsx_have_the_jobs_of_the_csv(tmp_path):
         book.active.append([time_of(cell) if ":" in cell else cell for cell in row])
     book.save(tmp_path / "jobs.xlsx")
     assert list(read_job_table(tmp_path / "jobs.xlsx").values()) == jobs
+    name = book.active["A2"]
+    name.value, name.number_format = 12, "0000"  # as a sheet shows 0012
+    book.active["J3"].value = None  # which waited for the row before
+    book.save(tmp_path / "jobs.xlsx")
+    assert [job.name for job in read_job_table(tmp_path / "jobs.xlsx").values()] == ["0012", "hold 1"]
 
 
 def time_of(cell: str) -> clock:

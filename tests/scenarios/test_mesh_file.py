@@ -187,6 +187,9 @@ WRONG = [
     ({"mesh": "tilted.obj"}, r"'tilted.obj' has a flat part of 1 × 1 × 1 m. Give it a thickness, or leave it out"),
     ({"mesh": "fine.stl"}, r"'fine.stl' has 327680 triangles; allowed are 1 to 100000. Export it more coarsely"),
     ({"mesh": "huge.stl"}, r"'huge.stl' has 64 MB; at most 64 are allowed"),
+    ({"mesh": "many.xml"}, r"'many.xml' has <replicate>, which makes shapes"),
+    ({"mesh": "polygon.obj"}, r"'polygon.obj' has a line of 12001 bytes; at most 10000 are allowed\. Use triangles"),
+    ({"mesh": "nodes.glb"}, r"'nodes.glb' describes its parts in 4000001 bytes; at most 4000000 are allowed"),
     ({}, r"fixtures\[0\].size_m must be three lengths"),
 ]
 
@@ -198,6 +201,9 @@ def test_a_file_that_cannot_be_used_is_refused_in_words(small_toml, fields, sent
     write_stl(folder / "small.stl", ((0, 0, 0), (0.8, 0.6, 0.02)))
     for ending in ("stl", "glb", "urdf"):
         (folder / f"text.{ending}").write_text("a text")
+    (folder / "many.xml").write_text('<mujoco><worldbody><replicate count="1000000000"/></worldbody></mujoco>')
+    (folder / "polygon.obj").write_text("f" + 6000 * " 1" + "\n")
+    (folder / "nodes.glb").write_bytes(b"glTF" + bytes(8) + (4_000_001).to_bytes(4, "little"))
     for name, height in (("flat", 0), ("tilted", 1)):
         (folder / f"{name}.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 1 1 {height}\nv 0 1 {height}\nf 1 2 3 4\n")
     if fields.get("mesh") == "fine.stl":

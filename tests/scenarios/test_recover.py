@@ -22,8 +22,20 @@ from fleet.heat.thermal import (
 )
 from fleet.job import Fixture
 from fleet.motion import static_drive
-from scenarios.motion.generate import Verification
-from scenarios.motion.recover import TICK_S, Nearby, RecoveryError, hold_until, holding, housing_estimate, recover
+from fleet.robot import Robot
+from scenarios.motion.generate import Verification, bare_arm
+from scenarios.motion.recover import (
+    TICK_S,
+    Nearby,
+    RecoveryError,
+    hold_until,
+    holding,
+    housing_estimate,
+    parse_posture,
+    recover,
+)
+from twin.thermal.checkpoint import save as save_network
+from twin.thermal.identify import Identified, ParameterVector, nominal_heat_model
 from twin.vae.twin import save
 
 HOLDS = {
@@ -122,6 +134,43 @@ def test_the_documented_command_recovers_an_arm(thermofleet, small_toml, subject
         wrong = thermofleet(*recover_left, option, value, "--out", tmp_path / "other")
         assert wrong.code == 2, option
         assert sentence in " ".join(wrong.err.split())
+        assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.ci_slow
+def test_an_arm_of_logs_needs_no_scenario(thermofleet, subject, tmp_path):
+    """With the network of a nominal Gen3 it is predicted as one, with its tilt and tool."""
+    vector = ParameterVector(nominal_heat_model())
+    about = {"arm": "arm", "rms_k": {}, "memory_s": (), "seconds": 0.0, "data_hash": "", "source": "current"}
+    about |= {"parameters": (), "ambient_c": 25.0, "ambient_sd_k": 1.0}
+    network = Identified(heat_model=vector.heat_model(vector.mean), **about)
+    save(subject.twin, tmp_path / "arm.twin")
+    save_network(network, tmp_path / "rc")
+    known = ("--twins", tmp_path / "arm.twin", "--network", tmp_path / "rc", "--tool", 0.5)
+    out = tmp_path / "recovery"
+    said = thermofleet("twin", "recover", *known, "--payload", 3, "--posture", "raised", "--out", out)
+    assert said.code == 0, said.err
+    robot = Robot(name="arm", tool_kg=0.5)
+    q = parse_posture("raised")
+    start_c = hold_until(bare_arm(robot, gen3_motors(), Verification.nominal(robot, 25.0).thermal), q, 3.0,
+                         ambient_c=25.0, until_c=50.0)  # fmt: skip
+    card = json.loads((out / "recovery.json").read_text(encoding="utf-8"))
+    assert card["start_c"] == pytest.approx(start_c[:7].max(), abs=1.0)  # it cools on the way there
+    out = tmp_path / "generated"
+    stops = ("--posture", "0,20,180,-90,0,-20,90", "--posture", "20,30,180,-60,0,-30,90")
+    said = thermofleet("twin", "generate", *known, *stops, "--count", 2, "--s", 0, "--out", out)
+    assert said.code == 0, said.err
+    assert json.loads((out / "generated.json").read_text(encoding="utf-8"))["handed_out"] == 2
+    for wrong, sentence in (
+        (known[2:], "Give a SCENARIO, or --twins and --network of an arm that is known by its logs"),
+        (known, "Without a SCENARIO no motion is known: give --posture at least twice"),
+        ((*known, *stops[:2]), "A motion has at least two postures (got 1)"),
+        ((*known, *stops, "--tilt", "0,90"), "The tilt is three angles in degrees, as 0,90,0 (got '0,90'"),
+        (("quickstart", "--tilt", "0,90,0"), "--tilt and --tool are for an arm without a scenario"),
+    ):
+        said = thermofleet("twin", "generate", *wrong, "--out", tmp_path / "other")
+        assert said.code == 2, wrong
+        assert sentence in " ".join(said.err.split())
         assert not (tmp_path / "other").exists()
 
 

@@ -302,7 +302,7 @@ def test_a_short_hold_is_told_but_stays(tmp_path: Path, caplog: pytest.LogCaptur
     path.write_text(stale(sound(), 100, 113), encoding="utf-8")
     with caplog.at_level(logging.WARNING, logger="twin.logs.reader"):
         assert len(read(path)[0].time_s) == ROWS
-    assert "4 % of its lines repeat the one before" in caplog.text
+    assert "4 % of the lines repeat the one before" in caplog.text
 
 
 HARMLESS: dict[str, Callable[[str], bytes]] = {

@@ -6,7 +6,7 @@ import os
 import re
 import zlib
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -464,15 +464,43 @@ def read(path: str | Path, *, damaged: Damaged = "refuse", measured: bool = True
         LogError: file, line and reason.
         ValueError: another value of `damaged`.
     """
+    path = Path(path)
+    found = _read(path, damaged, measured)
+    if measured:
+        _warn_of_repeats(path, {path: found})
+    return found
+
+
+def _read(path: Path, damaged: Damaged, measured: bool) -> list[Recording]:
+    """As `read`, without the warning of a slow logger."""
     if damaged not in get_args(Damaged):
         raise ValueError(f"damaged must be one of {', '.join(get_args(Damaged))} (got {damaged!r}).")
-    path = Path(path)
     name = _name(path)
     if path.is_dir():
         raise LogError(str(path), None, "is a folder; a log is a file.")
     if path.suffix == ".parquet":
         return [_recording(path, f"{name}/{arm}", table, damaged) for arm, table in read_arms(path).items()]
     return [_recording(path, name, read_csv(path), damaged, measured=measured)]
+
+
+def _warn_of_repeats(where: Path, by_file: Mapping[Path, Sequence[Recording]]) -> None:
+    """Log once if lines of CSV logs repeat the ones before for long."""
+    recordings = [each for file, found in by_file.items() if file.suffix != ".parquet" for each in found]
+    percent = sorted(share for each in recordings if (share := _repeated_percent(each)) > 0)
+    if percent:
+        many = f"in {len(percent)} of its {len(recordings)} logs " if len(recordings) > 1 else ""
+        log.warning(
+            "%s: %s%s %% of the lines repeat the one before, for more than %g s, as those of a slow logger. They are "
+            "used; motion between them is unknown.",
+            *(where, many, " to ".join(dict.fromkeys(f"{each:.0f}" for each in (percent[0], percent[-1]))), GAP_S),
+        )
+
+
+def _repeated_percent(recording: Recording) -> float:
+    """How many of the lines repeat the one before for long, %."""
+    readings = {name: values for name in READINGS if (values := getattr(recording, name)) is not None}
+    held = repeats(recording.time_s, readings, GAP_S)
+    return 100 * sum(end - start for start, end in held) / max(len(recording.time_s), 1)
 
 
 def read_folder(path: str | Path, *, damaged: Damaged = "refuse") -> list[Recording]:
@@ -493,17 +521,18 @@ def read_folder(path: str | Path, *, damaged: Damaged = "refuse") -> list[Record
     for f in files:
         if by_name[_name(f)] != f:
             raise LogError(str(path), None, f"'{f.name}' and '{by_name[_name(f)].name}' are the same log; keep one.")
-    recordings: list[Recording] = []
+    by_file: dict[Path, list[Recording]] = {}
     for f in files:
         try:
-            recordings += read(f, damaged=damaged)
+            by_file[f] = _read(f, damaged, measured=True)
         except LogError as error:
             if damaged == "refuse":
                 raise
             log.warning("skipped %s", error)
-    if not recordings:
+    if not by_file:
         raise LogError(str(path), None, f"none of its {len(files)} logs is usable; see the warnings.")
-    return recordings
+    _warn_of_repeats(path, by_file)
+    return [recording for found in by_file.values() for recording in found]
 
 
 def of_arm(recordings: Sequence[Recording], arm: str | None, path: Path) -> list[Recording]:
@@ -583,13 +612,6 @@ def _recording(
             warned.add(what)
     kept = {channel: np.ascontiguousarray(values[keep]) for channel, values in readings.items()}
     time_s = time_s[keep]
-    if is_csv and measured and not part and (held := repeats(time_s, kept, GAP_S)):
-        share = sum(end - start for start, end in held) / len(time_s)
-        log.warning(
-            "%s: %.0f %% of its lines repeat the one before, for more than %g s, as those of a slow logger. They are "
-            "used; motion between them is unknown.",
-            *(path, 100 * share, GAP_S),
-        )
     if len(time_s) and time_s[0] >= EPOCH_S:
         time_s = time_s - time_s[0]
     return Recording(name=name, time_s=time_s, **kept, dropped=dropped)
