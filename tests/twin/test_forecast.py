@@ -162,6 +162,24 @@ def test_the_same_seed_gives_the_same_forecast_and_short_cycles_that_of_long_one
     np.testing.assert_allclose(short.interval()[1][-1], found.interval()[1][-1], atol=0.02)
 
 
+def test_a_plan_at_rest_stays_and_late_rows_of_a_moving_one_are_left_out(hour) -> None:
+    log = hour[1]
+    hold = held(FULL_REACH_NM)
+    warm = replace(hold, temp_c=np.full((len(hold.time_s), JOINTS), 30.0))
+    assert (forecast(log, warm, 5).sampled_c == forecast(log, hold, 5).sampled_c).all()
+    # Ten seconds of load between two of none, of which a late logger repeats the last loaded row for eight more.
+    tau = np.where((hold.time_s[:, None] > 10.0) & (hold.time_s[:, None] <= 20.0), FULL_REACH_NM, 0.0)
+    temp_c = 30.0 + 0.01 * hold.time_s[:, None] + np.zeros(JOINTS)
+    moving = replace(warm, qd=hold.qd + 0.001, tau=tau, temp_c=temp_c)
+    late = np.arange(len(hold.time_s))
+    late[40:56] = 40
+    stale = replace(moving, qd=moving.qd[late], tau=tau[late], temp_c=temp_c[late])
+    true_c, late_c, held_on_c = (
+        np.median(forecast(log, each, 20).sampled_c[:, -1, 1]) for each in (moving, stale, replace(stale, temp_c=None))
+    )
+    assert abs(late_c - true_c) < 0.6 * (held_on_c - true_c)
+
+
 def test_a_forecast_needs_temperatures_time_and_a_whole_plan(hour) -> None:
     _, log, _, _ = hour
     plan = held(FULL_REACH_NM)
