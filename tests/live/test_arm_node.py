@@ -69,8 +69,12 @@ class Auctioneer:
 
 
 @pytest.fixture
-def bus(tmp_path, small):
-    """A router; makers of arms and lines; and what serves them all until something is true."""
+def bus(tmp_path, small, monkeypatch):
+    """A router; makers of arms and lines; and what serves them all until something is true.
+
+    An arm replies when it has planned, however slow the machine is.
+    """
+    monkeypatch.setattr("fleet.live.arm.node.PLANNING_S", PATIENCE_S / 2)
     with ExitStack() as stack:
         router = stack.enter_context(Router())
         nodes, links = [], []
@@ -327,8 +331,9 @@ def test_fleet_time_is_the_auctioneers_from_the_first_message(bus):
     assert arm.body.truth.tick[0] < 1000  # set, not lived through
 
 
-def test_planning_delays_state_messages_by_one_plan_at_most(bus):
+def test_planning_delays_state_messages_by_one_plan_at_most(bus, monkeypatch):
     """Twenty motions of 50 ms each: the answer comes within its time, states go on, and the rest is planned after."""
+    monkeypatch.setattr("fleet.live.arm.node.PLANNING_S", PLANNING_S)
     planned = []
     own = bus.small.arm(0, [bus.small.work("bench")])
 
