@@ -3,7 +3,7 @@
 Rows are reset here, and reward terms, named and weighted in the scenario, are summed here and reported apart.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, dataclass, field, fields
 from typing import Any
@@ -200,6 +200,8 @@ class Shift:
     """Of the sensor noise, 64 bits; see `fleet.seeding`."""
     absences: Array = field(default_factory=no_absences)
     """Breaks and failures of the arms, `ABSENCE` [absence]."""
+    names: tuple[str, ...] = ()
+    """Of the jobs, for people; may be left out."""
 
 
 Parts = tuple[Array, Array]
@@ -382,7 +384,14 @@ class Engine:
         """Put what the arms of some envs know now into `out`, and what has become of them into `infos`."""
         self._run(OFFER + OBSERVE, _NO_ACTIONS, np.empty((self.envs, OUTCOME)), envs, out)
 
-    def step(self, actions: Array | None, out: Parts, until: Array | None = None) -> Array:
+    def step(
+        self,
+        actions: Array | None,
+        out: Parts,
+        until: Array | None = None,
+        *,
+        drive: Callable[[State], Drive] | None = None,
+    ) -> Array:
         """One decision interval of every env, or more.
 
         Args:
@@ -391,35 +400,29 @@ class Engine:
             out: Receives what the arms know afterwards.
             until: Go on while no arm has a `choice`, to this tick at most, int64 [env]. The events and the trace are
                 then those of the last interval alone.
+            drive: Returns the mean heat drive over the coming interval, each [env, arm, joint], from the state with the
+                awards made; without it the arms move as planned.
 
         Returns:
             Outcomes, [env, OUTCOME]: weighted reward terms, and the columns of `fleet.engine.step.OUTCOME`.
         """
-        self._clear_events()
-        if actions is None:
-            return self._stepped(MOVE + OFFER + OBSERVE, _NO_ACTIONS, out, until)
-        return self._stepped(CLAIM + MOVE + OFFER + OBSERVE, actions, out, until)
+        self._simulation.events.used[0] = 0
+        claims = CLAIM if actions is not None else 0
+        actions = _NO_ACTIONS if actions is None else actions
+        if drive is not None:
+            if claims:
+                self._run(claims, actions, _no_terms(self.envs), self._all, _NO_VECTORS)
+            self._keep_drive(drive(self.state))
+            claims = 0
+        return self._stepped(claims + MOVE + OFFER + OBSERVE, actions, out, until)
 
-    def claim(self, actions: Array | None) -> None:
-        """The first part of `step` alone: award jobs. `move` must follow."""
-        self._clear_events()
-        if actions is not None:
-            self._run(CLAIM, actions, _no_terms(self.envs), self._all, _NO_VECTORS)
-
-    def move(self, drive: Drive, out: Parts) -> Array:
-        """The rest of `step`, for arms that were seen to move.
-
-        Args:
-            drive: Mean heat drive over the step, each [env, arm, joint].
-            out: As in `step`, like the result.
-        """
+    def _keep_drive(self, drive: Drive) -> None:
         measured = self._simulation.drive
         if not len(measured):
             measured = np.zeros((self.envs, self.layout.arms), DRIVE)
             self._simulation = self._simulation._replace(drive=measured)
             self._prepare()
         measured["current_sq"][..., :JOINTS], measured["friction_w"][..., :JOINTS] = drive.current_sq, drive.friction_w
-        return self._stepped(MOVE + OFFER + OBSERVE, _NO_ACTIONS, out)
 
     def play(self, schedules: Plans, discount: Array) -> Script:
         """Execute one schedule in each of the first rows, from the present state to the end of the shift.
@@ -451,9 +454,6 @@ class Engine:
             for each in done:
                 each.result()
         return terms
-
-    def _clear_events(self) -> None:
-        self._simulation.events.used[0] = 0
 
     def _run(
         self,
@@ -542,7 +542,7 @@ def _widen(after: Array, waits: int) -> Array:
 
 
 def shifts_of(state: State, noise_keys: Sequence[int]) -> list[Shift]:
-    """The shifts of a world as `tables_of` gives it, with the keys of their sensor noise."""
+    """The shifts of a state, with the keys of their sensor noise."""
     return [
         Shift(
             fleet=int(state.fleet[e]),

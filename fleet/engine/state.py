@@ -1,18 +1,14 @@
-"""The simulator's two values: what is fixed for a shift (`World`) and what changes (`State`).
+"""What changes in the simulator during a shift.
 
 Arrays have a leading env axis [env, ...]; a single shift is env = 1.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
 
-from fleet.difficulty import Forecast
-from fleet.heat.motor import Motors
-from fleet.heat.thermal import NODES, HousingObserver, ThermalModel
-from fleet.motion import Drive
-from fleet.robot import JOINTS, ThermalLimits
+from fleet.heat.thermal import NODES
+from fleet.robot import JOINTS
 
 Array = np.ndarray
 
@@ -28,137 +24,6 @@ ABSENCE = np.dtype([("arm", "i4"), ("begin", "i4"), ("end", "i4"), ("kind", "i4"
 def no_absences() -> Array:
     """Absences of a shift without any, `ABSENCE` [0]."""
     return np.zeros(0, ABSENCE)
-
-
-@dataclass(frozen=True, eq=False)
-class JobTable:
-    """The jobs of each env as arrays; rows beyond an env's jobs have `exists` False."""
-
-    names: tuple[tuple[str, ...], ...]
-    """[env][job]."""
-    exists: Array
-    """bool [env, job]."""
-    release_s: Array
-    due_s: Array
-    value: Array
-    payload_kg: Array
-    repetitions: Array
-    """int [env, job]."""
-    after: Array
-    """Indices of the jobs that must be done first, int [env, job, n], −1 for none."""
-    expires: Array
-    """Whether the job expires at its due date if no arm has begun it, bool [env, job]."""
-    alike: Array
-    """Jobs of one work have the same number: what is measured in one holds for all, int [env, job]."""
-    stations: Array
-    """Indices of the stations it occupies, int [env, job, n], −1 for none."""
-
-
-@dataclass(frozen=True, eq=False)
-class PlanTable:
-    """The distinct plans as arrays; phases are approach, cycle, retreat."""
-
-    times_s: Array
-    """Duration of each phase, [plan, phase]."""
-    current_sq: Array
-    """Mean squared reference current, A², [plan, phase, joint]."""
-    friction_w: Array
-    """Mean friction heat, W, [plan, phase, joint]."""
-    peak_tau: Array
-    """Largest torque magnitude, N·m, [plan, joint]."""
-    volume: Array
-    """Index of the space that the arm takes, int [plan]."""
-    excess: Array
-    """Heat of a cycle that the arm measures over that which it expects, less 1, [plan]."""
-
-
-@dataclass(frozen=True, eq=False)
-class Offers:
-    """The plans of each arm for each job, the fastest first, and their scores."""
-
-    plan: Array
-    """Row of the `PlanTable`, int [env, arm, job, plan]; −1 where the arm has none."""
-    difficulty: Array
-    """d, [env, arm, job, plan]; NaN where there is no score."""
-    p_saturation: Array
-    """Probability from models that ignore the start temperature, [env, arm, job, plan]; NaN where unknown."""
-    risk: Array
-    """Row of `forecasts` for P, int [env, arm, job, plan]; −1 where the model has none."""
-    peak: Array
-    """Row of `forecasts` for the peak temperature, int [env, arm, job, plan]; −1 where the model has none."""
-    forecasts: Forecast | None
-    """[forecast, ...]; None where no model of the fleet has any."""
-
-
-@dataclass(frozen=True, eq=False)
-class Law:
-    """How arms heat up in a decision interval, arrays [arm, ...]."""
-
-    motors: Motors
-    thermal: ThermalModel
-    phi: Array
-    gamma: Array
-    """Step matrices, [arm, node, node]."""
-
-
-@dataclass(frozen=True, eq=False)
-class World:
-    """Everything that does not change during a shift."""
-
-    arms: tuple[str, ...]
-    stations: tuple[str, ...]
-    dt_s: float
-    """Decision interval: the length of one step."""
-    ticks: int
-    """Steps until the horizon."""
-    slots: int
-    """Jobs on offer at a time, K."""
-    ambient_c: Array
-    """Ambient temperature at each arm during each tick, °C, [tick, arm]."""
-    thermal: ThermalModel
-    """[arm, ...]."""
-    motors: Motors
-    """[arm, joint]."""
-    limits: ThermalLimits
-    torque_warning: Array
-    """N·m, [joint]."""
-    rest: Drive
-    """Heat drive of standing in the home posture, [arm, joint]."""
-    plans: PlanTable
-    jobs: JobTable
-    offers: Offers
-    conflicts: Array
-    """Whether two arms cannot take two volumes at a time, bool [volume, volume]."""
-    observer: HousingObserver
-    """How each arm estimates its housing temperatures, [arm, ...]."""
-    start_c: Array
-    """Temperatures at the start of the shift, [arm, node]."""
-    start_housing_c: Array
-    """Estimates of the housing temperatures at the start, [arm, joint]."""
-    phi: Array
-    gamma: Array
-    """Step matrices for `dt_s`, [arm, node, node]."""
-    drift_k_per_s: Array
-    """Drift of the readings of motor temperatures from the start of the shift, [arm]."""
-    believed: Law | None
-    """What the arms believe of their heat, if they learn: see `fleet.engine.world.Arm.learns`."""
-    absences: Array
-    """Breaks and failures of the arms in every env, `ABSENCE` [absence]."""
-
-    @property
-    def horizon_s(self) -> float:
-        """Length of the shift, s."""
-        return self.ticks * self.dt_s
-
-    @property
-    def plans_per_job(self) -> int:
-        """Plans that an arm may have for a job."""
-        return self.offers.plan.shape[-1]
-
-    @property
-    def envs(self) -> int:
-        """Number of parallel shifts."""
-        return len(self.jobs.exists)
 
 
 LANES = JOINTS + 1

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from fleet.bus.exchange.channel import Channel
 from fleet.bus.exchange.memory import Exchange
-from fleet.engine.batch import BLOCK, shifts_of
-from fleet.engine.tables import stack_tables, tables_of
+from fleet.engine.batch import BLOCK
+from fleet.engine.tables import stack_tables
 from fleet.engine.world import Space
 from fleet.env.vector import BatchEnv, Library, Shelf
 from fleet.motion import Plan
@@ -499,9 +499,8 @@ def test_variants_with_different_risk_models_do_not_mix(small, play) -> None:
         jobs = [small.job(f"j{j}", content[j % 3], release_s=30.0 * (j // 2), repetitions=2 + j % 2) for j in range(9)]
         space = (None, small.crowded(0.4), sparse(small.crowded(0.4)))[fleet]
         world, _ = small.shop([jobs], arms=arms, ticks=40, ambient_c=30.0 + fleet, space=space)
-        own_tables, drawn = tables_of(world)
-        tables.append(own_tables)
-        shifts += shifts_of(drawn, [77])
+        tables.append(world.tables)
+        shifts.append(replace(world.shifts[0], noise_key=77))
     assert len({(*table.forecast_block.shape, *table.forecast_curve.shape) for table in tables}) == 3
     assert [table.excluded.shape[1] for table in tables] == [1, 1, 3]
     assert [bool(table.excluded.any()) for table in tables] == [False, True, True]
