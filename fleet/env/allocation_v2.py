@@ -24,13 +24,12 @@ from fleet.engine.shift import EpisodeFactory as EpisodeFactory
 from fleet.engine.shift import Watch, events_of, record_of
 from fleet.engine.state import State
 from fleet.engine.step import FINISHED, OUTCOME, TICK, TOTAL
-from fleet.engine.tables import INFO
 from fleet.engine.world import World
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.render.renderer import Renderer
 from fleet.env.render.scene import CellMap
 from fleet.env.validation import Decisions, actions_of, agent_of, at_least_one, check_choice, seed_of
-from fleet.env.vector import AHEAD_S, BatchEnv, Library, arm_spaces
+from fleet.env.vector import AHEAD_S, REWARDS, BatchEnv, Library, arm_spaces
 from fleet.events import Event
 from fleet.heat.thermal import WINDING
 from fleet.observation import Observation
@@ -104,7 +103,6 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         self.render_mode = render_mode
         self.events: list[Event] = []
         self._make_episode = make_episode
-        self._max_cycles = None if max_cycles is None else at_least_one("max_cycles", max_cycles)
         self._keep_events = keep_events
         self._watch = watch
         self._renderer = Renderer(cell)
@@ -112,7 +110,8 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         self._until_choice = decisions == "events"
         self._seeds = np.random.SeedSequence()
         self._draw(np.random.SeedSequence(0))
-        arms = self.world.arms
+        arms, ticks = self.world.arms, self.world.ticks
+        self._last_tick = ticks if max_cycles is None else min(ticks, at_least_one("max_cycles", max_cycles))
         self.possible_agents = list(arms)
         self.agents: list[str] = []
         self._exchange = exchange or Exchange(arms)
@@ -137,7 +136,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             self.observation_spaces[arm] = observation["observation"] if mask_in == "info" else observation
         low, high = self.layout.bounds
         self.state_space = spaces.Box(np.tile(low, len(arms)), np.tile(high, len(arms)), dtype=np.float32)
-        self._started = False
+        self._started, self._tick = False, 0
         self._delivered_before = 0
 
     def _draw(self, seed: np.random.SeedSequence) -> Shift:
@@ -167,7 +166,8 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
     @property
     def tick(self) -> int:
         """Elapsed decision intervals of this episode."""
-        return int(self._begun("counting steps").engine.state.tick[0])
+        self._begun("counting steps")
+        return self._tick
 
     @property
     def messages(self) -> int:
@@ -202,9 +202,10 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             self.batch = self._one_row()
         self._delivered_before = self._exchange.delivered
         self.batch.begin(_FIRST, [shift], [self._episode.sensors])
-        self.agents, self.events, self._started = list(self.possible_agents), [], True
+        self.agents, self.events = list(self.possible_agents), []
+        self._started, self._tick = True, 0
         observations, masks = self._observations()
-        return observations, self._infos(np.zeros((1, OUTCOME)), masks, 0.0)
+        return observations, self._infos(np.zeros(OUTCOME), masks, 0.0)
 
     def step(
         self, actions: dict[str, Any]
@@ -215,10 +216,10 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             RuntimeError: before reset, or after the end.
             ValueError: no dictionary, an action that is no integer, or one of an agent that is not there.
         """
-        before = self.tick
+        before = self._tick
         outcome, finished, over = self.advance(actions)
         observations, masks = self._observations()
-        infos = self._infos(outcome[None], masks, (outcome[TICK] - before) * self.world.dt_s)
+        infos = self._infos(outcome, masks, (self._tick - before) * self.batch.engine.tables.dt_s)
         reward, arms = float(outcome[TOTAL]), self.possible_agents
         return (
             observations,
@@ -238,14 +239,13 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         if not self.agents:
             raise RuntimeError("The episode is over: call reset() before step().")
         chosen = actions_of(self.possible_agents, actions)
-        last_tick = min(self.world.ticks, self._max_cycles or self.world.ticks)
-        outcome = self._advance(batch, chosen[None])
+        outcome, last_tick = self._advance(batch, chosen[None]), self._last_tick
         while self._until_choice and not outcome[FINISHED] and outcome[TICK] < last_tick and not batch.engine.choice[0]:
             more = self._advance(batch, None)
             more[: TOTAL + 1] += outcome[: TOTAL + 1]
             outcome = more
-        finished = bool(outcome[FINISHED])
-        over = not finished and bool(outcome[TICK] >= last_tick)
+        self._tick, finished = int(outcome[TICK]), bool(outcome[FINISHED])
+        over = not finished and self._tick >= last_tick
         if finished or over:
             self.agents = []
         return outcome, finished, over
@@ -253,7 +253,8 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
     def _advance(self, batch: BatchEnv, actions: Array | None) -> Array:
         """One decision interval; return its outcome."""
         episode, engine = self._episode, batch.engine
-        outcome = batch.advance(actions, drive=episode.drive)[0]
+        outcome = engine.step(actions, batch.parts, drive=episode.drive)[0]
+        batch.deliver(_FIRST)
         if self._keep_events:
             self.events += events_of(episode.world, engine.state, engine.events)
             if not episode.plant.follows_plans:
@@ -314,12 +315,13 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         return {arm: {"observation": vectors[a], "action_mask": masks[a]} for a, arm in enumerate(arms)}, masks
 
     def _infos(self, outcome: Array, masks: Array, elapsed_s: float) -> dict[str, dict[str, Any]]:
-        figures = {name: values[0].tolist() for name, values in self.batch.figures(outcome).items()}
-        own = {name: figures.pop(name) for name in INFO.names or ()}
-        figures["elapsed_s"] = float(elapsed_s)
+        *rewards, _, _, jobs_done, _ = outcome.tolist()
+        of_all = {"jobs_done": jobs_done, "elapsed_s": elapsed_s, **dict(zip(REWARDS, rewards, strict=True))}
         infos: dict[str, dict[str, Any]] = {
-            arm: {**dict(zip(own, each, strict=True)), **figures}
-            for arm, each in zip(self.possible_agents, zip(*own.values(), strict=True), strict=True)
+            arm: {"faults": faults, "illegal": illegal, "peak_c": peak_c, "above_warning_s": above_s, **of_all}
+            for arm, (faults, illegal, peak_c, above_s) in zip(
+                self.possible_agents, self.batch.engine.infos[0].tolist(), strict=True
+            )
         }
         if self._mask_in != "obs":
             for a, info in enumerate(infos.values()):

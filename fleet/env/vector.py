@@ -23,7 +23,6 @@ from fleet.engine.step import FINISHED, JOBS_DONE, OUTCOME, TICK, TOTAL
 from fleet.engine.tables import INFO, Tables
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.validation import Decisions, at_least_one, check_choice, seeds_of, switch
-from fleet.motion import Drive
 from fleet.observation import Layout, Observation
 from fleet.seeding import exchange_seed, shift_seeds
 
@@ -86,6 +85,8 @@ def keep_pages() -> bool:
     return mallopt is not None and all(mallopt(which, _MOST) == 1 for which in (_MMAP_THRESHOLD, _TRIM_THRESHOLD))
 
 
+REWARDS = tuple(f"reward_{name}" for name in TERMS)
+"""Names of the reward terms in infos."""
 AHEAD_S = 0.0
 """Options are given to free arms; see `Layout.ahead_s`."""
 
@@ -148,7 +149,8 @@ class BatchEnv:
         keep_events, trace: As `events` and `trace` of `fleet.engine.batch.Engine`.
 
     Attributes:
-        engine: Steps the shifts; of them, `step` of this class keeps account.
+        engine: Steps the shifts.
+        parts: Both parts of the current observations.
     """
 
     def __init__(
@@ -210,7 +212,6 @@ class BatchEnv:
             threads=at_least_one("threads", threads),
         )
         self.parts = self._no_parts()
-        """Both parts of the current observations."""
         self._all = np.arange(num_envs)
         self._seeds = seeds_of(seed, num_envs)
         self._fresh = np.ones(num_envs, dtype=bool)
@@ -302,9 +303,13 @@ class BatchEnv:
             raise RuntimeError(
                 f"The shift of {len(which)} env(s) is over (first: env {which[0]}): call reset(rows=…) before step()."
             )
-        outcome = self.advance(self._checked(actions), self._last_tick if self._until_choice else None)
-        finished = outcome[:, FINISHED] > 0
-        truncated = ~finished & (self._tick >= self._last_tick)
+        chosen, parts = self._checked(actions), self._no_parts()
+        outcome = self.engine.step(chosen, parts, self._last_tick if self._until_choice else None)
+        tick, finished = outcome[:, TICK], outcome[:, FINISHED] > 0
+        self._elapsed_s = (tick - self._tick) * self.engine.tables.dt_s
+        self._tick, self.parts = tick, parts
+        self.deliver(self._all)
+        truncated = ~finished & (tick >= self._last_tick)
         self._over = finished | truncated
         ended = np.flatnonzero(self._over)
         self._last_tick[ended] = self._whole
@@ -313,25 +318,6 @@ class BatchEnv:
         if last is not None:
             self._begin(ended)
         return self._obs(), outcome[:, TOTAL].copy(), finished, truncated, info
-
-    def advance(
-        self,
-        actions: Array | None,
-        until: Array | None = None,
-        drive: Callable[[State], Drive] | None = None,
-    ) -> Array:
-        """As `fleet.engine.batch.Engine.step`, with the observations in `parts`; shifts that end are left as they are.
-
-        Args:
-            actions: int64 [env, arm], or None.
-        """
-        parts = self._no_parts()
-        outcome = self.engine.step(actions, parts, until, drive=drive)
-        self._elapsed_s = (outcome[:, TICK] - self._tick) * self.engine.tables.dt_s
-        self._tick, self.parts = outcome[:, TICK], parts
-        if self._exchanges is not None:
-            self._deliver(self._all, parts)
-        return outcome
 
     def joined(self, obs: Obs) -> Obs:
         """Both parts of observations as one vector for each arm: {"observation": [env, arm, size], "action_mask"}."""
@@ -371,7 +357,7 @@ class BatchEnv:
             for e, shift, seed in zip(rows.tolist(), shifts, sensors, strict=True):
                 self._exchanges[e].begin(np.random.default_rng(exchange_seed(seed)))
                 self._names[e] = shift.names or tuple(map(str, range(len(shift.kind))))
-            self._deliver(rows, self.parts)
+        self.deliver(rows)
 
     def _observe(self, rows: Array, parts: Parts) -> None:
         """Write the current observations of some envs into `parts` again."""
@@ -381,14 +367,14 @@ class BatchEnv:
             for part, delivered in zip(parts, self._delivered, strict=True):
                 part[rows] = delivered[rows]
 
-    def _deliver(self, rows: Array, parts: Parts) -> None:
-        """Replace what the arms observe of each other by the delivered messages."""
-        assert self._exchanges is not None
-        assert self._delivered is not None
+    def deliver(self, rows: Array) -> None:
+        """Replace what the arms of some envs observe of each other, in `parts`, by the delivered messages."""
+        if self._exchanges is None or self._delivered is None:
+            return
         twins = self._library.twins or ("",) * len(self.agents)
         for e in rows.tolist():
-            deliver(self._exchanges[e], self.engine, parts, self._names[e], twins, e)
-        for part, delivered in zip(parts, self._delivered, strict=True):
+            deliver(self._exchanges[e], self.engine, self.parts, self._names[e], twins, e)
+        for part, delivered in zip(self.parts, self._delivered, strict=True):
             delivered[rows] = part[rows]
 
     def _obs(self, rows: Array | None = None) -> Obs:
@@ -397,22 +383,20 @@ class BatchEnv:
             return {"shared": shared, "own": own, "action_mask": self.engine.mask.copy()}
         return {"shared": shared[rows], "own": own[rows], "action_mask": self.engine.mask[rows]}
 
-    def figures(self, outcome: Array) -> dict[str, Array]:
-        """What has become of the arms, [env, arm], and of the shifts, [env], after a step: the infos of all envs."""
-        infos = self.engine.infos.copy()
-        return {
-            **{name: infos[name] for name in INFO.names or ()},
-            "jobs_done": outcome[:, JOBS_DONE],
-            "elapsed_s": self._elapsed_s,
-            **{f"reward_{name}": outcome[:, n] for n, name in enumerate(TERMS)},
-        }
-
     def _info(self, outcome: Array, ended: Array, last: Obs | None) -> dict[str, Any]:
+        infos = self.engine.infos.copy()
         if last is None:
             shared, own = empty_parts(self.layout, 0)
             mask = np.zeros((0, self.layout.arms, self.layout.actions), np.int8)
             last = {"shared": shared, "own": own, "action_mask": mask}
-        return {**self.figures(outcome), "final_envs": ended, "final_obs": last}
+        return {
+            **{name: infos[name] for name in INFO.names or ()},
+            "jobs_done": outcome[:, JOBS_DONE],
+            "elapsed_s": self._elapsed_s,
+            **{name: outcome[:, n] for n, name in enumerate(REWARDS)},
+            "final_envs": ended,
+            "final_obs": last,
+        }
 
     def _no_parts(self) -> Parts:
         """Arrays for observations: unused ones of an earlier step, if there are any."""
