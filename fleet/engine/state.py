@@ -54,14 +54,16 @@ ARM = np.dtype(
         ("last_award", "i1"),
         ("pending", "?"),
         ("absent", "i1"),
-        ("unused", "i1", 8),
+        ("break_tick", "i4"),
+        ("unused", "i1", 4),
     ],
     align=True,
 )
 """All that changes of an arm, four cache lines, the last of which is all that claims need; see the properties of
 `State`. `current_sq` and `friction_w` are the heat drive of the present phase of its plan, which ends when `progress_s`
 is `phase_end_s`; `kind` is that of its job, and `pending` whether the job is still to be finished (False on the way
-home). `absent` is the kind of the present absence, 0 for none."""
+home). `absent` is the kind of the present absence, 0 for none, and
+`break_tick` when the next break begins, or the present one began."""
 
 JOB = np.dtype(
     [

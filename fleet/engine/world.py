@@ -452,15 +452,12 @@ def _shift_of(jobs: Sequence[Job], first_kind: int, absences: Array | None) -> S
     for row, job in zip(after, jobs, strict=True):
         row[: len(job.after)] = [index[name] for name in job.after]
     return Shift(
-        fleet=0,
-        ambient_offset_k=0.0,
         kind=np.arange(first_kind, first_kind + len(jobs)),
         release_s=np.array([job.release_s for job in jobs], dtype=float),
         due_s=np.array([job.due_s for job in jobs], dtype=float),
         repetitions=np.array([job.repetitions for job in jobs], dtype=int),
         expires=np.array([job.expires for job in jobs], dtype=bool),
         after=after,
-        noise_key=0,
         absences=no_absences() if absences is None else absences,
         names=tuple(index),
     )

@@ -311,19 +311,12 @@ class ShiftFactory:
         """
         conditions = self.fleet.conditions(seed)
         jobs_seed, sensor_seed = shift_seeds(seed)
-        jobs = self._sampler.sample(jobs_seed, conditions.arrivals)
-        return Shift(
+        return replace(
+            self._sampler.shift(jobs_seed, conditions.arrivals, named=named),
             fleet=conditions.fleet,
             ambient_offset_k=conditions.ambient_k,
-            kind=jobs.kind,
-            release_s=jobs.release_s,
-            due_s=jobs.due_s,
-            repetitions=jobs.repetitions,
-            expires=jobs.expires,
-            after=jobs.after,
             noise_key=key_of(sensor_seed),
             absences=absences_of(self.fleet.all[conditions.fleet].scenario, seed),
-            names=self._sampler.names(jobs) if named else (),
         )
 
     def __call__(self, seed: np.random.SeedSequence) -> "Episode":

@@ -9,14 +9,14 @@ The two factors of the price, `fleet.engine.batch.FaultPrice`, follow from the s
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from itertools import product
 
 import numpy as np
 
 from fleet.arrivals import ArrivalTable, arrival_table, sample_arrivals, scale_rate
-from fleet.engine.batch import FaultPrice, RewardWeights
+from fleet.engine.batch import FaultPrice, RewardWeights, Shift
 from fleet.errors import ScenarioError
 from fleet.heat.motor import gen3_motors
 from fleet.heat.thermal import NODES, WINDING, gen3_network, node_heat, thermal_model
@@ -66,27 +66,6 @@ def kinds_of(scenario: Scenario) -> list[Job]:
         for others in [tuple(rest)]
         for repetitions in range(stream.repetitions[0], stream.repetitions[1] + 1)
     ]  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class SampledJobs:
-    """The jobs of one shift as arrays [job], in order of release, then of stream and number."""
-
-    stream: Array
-    """Index into the scenario's streams."""
-    number: Array
-    """Number of the job in its stream, from 0."""
-    payload: Array
-    """Index into the stream's payloads."""
-    kind: Array
-    """Index of `kinds_of`."""
-    repetitions: Array
-    expires: Array
-    """bool [job]."""
-    release_s: Array
-    due_s: Array
-    after: Array
-    """Indices of the jobs that must finish first, int [job, n], −1 for none."""
 
 
 @kernel
@@ -174,11 +153,12 @@ class JobSampler:
     def _kinds(self) -> list[Job]:
         return kinds_of(self._scenario)
 
-    def sample(self, seed: np.random.SeedSequence, rate: float = 1.0) -> SampledJobs:
-        """The jobs of one shift.
+    def shift(self, seed: np.random.SeedSequence, rate: float = 1.0, *, named: bool = True) -> Shift:
+        """The jobs of one shift in order of release, then of stream and number.
 
         Args:
             rate: Factor on the rates of Poisson streams and repeated batches.
+            named: With the names of the jobs.
         """
         table = self._table
         if rate != 1.0:
@@ -192,40 +172,32 @@ class JobSampler:
                 break
             self._room *= 2
         stream, number, payload, extra = job[:total].T
-        release_s = release_s[:total]
-        return SampledJobs(
-            stream=stream,
-            number=number,
-            payload=payload,
+        numbered = zip(stream.tolist(), number.tolist(), strict=True) if named else ()
+        return Shift(
             kind=self._first_kind[stream] + payload * self._choices[stream, 1] + extra,
+            release_s=release_s[:total],
+            due_s=release_s[:total] + self._due_s[stream],
             repetitions=self._fewest[stream] + extra,
             expires=self._expires[stream],
-            release_s=release_s,
-            due_s=release_s + self._due_s[stream],
             after=after[:total],
+            names=tuple(job_name(self._streams[i], n) for i, n in numbered),
         )
 
-    def names(self, sampled: SampledJobs) -> tuple[str, ...]:
-        """Names of sampled jobs."""
-        each = zip(sampled.stream.tolist(), sampled.number.tolist(), strict=True)
-        return tuple(job_name(self._streams[stream], number) for stream, number in each)
-
     def jobs(self, seed: np.random.SeedSequence, rate: float = 1.0) -> tuple[Job, ...]:
-        """The jobs of one shift in order of release; `rate` as in `sample`."""
-        sampled = self.sample(seed, rate)
-        names = self.names(sampled)
-        columns = (sampled.kind, sampled.release_s, sampled.due_s, sampled.after, sampled.expires)
+        """The jobs of `shift`."""
+        shift = self.shift(seed, rate)
+        columns = (shift.kind, shift.release_s, shift.due_s, shift.after, shift.expires)
         return tuple(
             replace(
                 self._kinds[kind],
                 name=name,
                 release_s=release_s,
                 due_s=due_s,
-                after=tuple(names[k] for k in after if k >= 0),
+                after=tuple(shift.names[k] for k in after if k >= 0),
                 expires=expires,
             )
             for name, kind, release_s, due_s, after, expires in zip(
-                names, *(column.tolist() for column in columns), strict=True
+                shift.names, *(column.tolist() for column in columns), strict=True
             )
         )
 
