@@ -107,6 +107,17 @@ is the tick at which the next absence begins or ends. `alarm`: an arm at work ha
 step."""
 
 
+class Column:
+    """A field of the records of a `State`, as an array."""
+
+    def __init__(self, records: str, name: str) -> None:
+        self._records, self._name = records, name
+
+    def __get__(self, state: "State", owner: type) -> Array:
+        """View of the field in all records."""
+        return getattr(state, self._records)[self._name]
+
+
 class State(NamedTuple):
     """All that changes during the shifts; kernels write into the records, whose fields the properties show."""
 
@@ -143,169 +154,79 @@ class State(NamedTuple):
 
     def named(self) -> dict[str, Array]:
         """The properties by name."""
-        return {name: getattr(self, name) for name, kind in vars(State).items() if isinstance(kind, property)}
+        return {name: getattr(self, name) for name, kind in vars(State).items() if isinstance(kind, property | Column)}
 
-    @property
-    def tick(self) -> Array:
-        """Decision intervals that are over, int [env]."""
-        return self.env["tick"]
-
-    @property
-    def fleet(self) -> Array:
-        """Which fleet of the tables, int [env]."""
-        return self.env["fleet"]
-
-    @property
-    def number(self) -> Array:
-        """Number of jobs, int [env]."""
-        return self.env["number"]
-
-    @property
-    def unfinished(self) -> Array:
-        """Jobs neither done nor given up, int [env]."""
-        return self.env["unfinished"]
+    tick = Column("env", "tick")
+    """Decision intervals that are over, int [env]."""
+    fleet = Column("env", "fleet")
+    """Which fleet of the tables, int [env]."""
+    number = Column("env", "number")
+    """Number of jobs, int [env]."""
+    unfinished = Column("env", "unfinished")
+    """Jobs neither done nor given up, int [env]."""
 
     @property
     def done(self) -> Array:
         """Jobs done, int [env]."""
         return self.env["number"] - self.env["unfinished"] - self.env["given_up"]
 
-    @property
-    def temp_c(self) -> Array:
-        """[env, arm, node]."""
-        return self.arms["temp_c"]
+    temp_c = Column("arms", "temp_c")
+    """[env, arm, node]."""
 
     @property
     def housing_c(self) -> Array:
         """What each arm estimates its housing temperatures to be, [env, arm, joint]."""
         return self.arms["housing_c"][..., :JOINTS]
 
-    @property
-    def mode(self) -> Array:
-        """IDLE, WORKING or FAULTED, int [env, arm]."""
-        return self.arms["mode"]
-
-    @property
-    def job(self) -> Array:
-        """Index of the current job, int [env, arm], −1 for none."""
-        return self.arms["job"]
-
-    @property
-    def plan(self) -> Array:
-        """Row of the plan table along which the arm is away from home, int [env, arm]; −1 at home."""
-        return self.arms["plan"]
-
-    @property
-    def progress_s(self) -> Array:
-        """How far along it, in its time since leaving home, [env, arm]; a fault stops it."""
-        return self.arms["progress_s"]
-
-    @property
-    def todo(self) -> Array:
-        """Cycles the arm set out to do, int [env, arm]."""
-        return self.arms["todo"]
-
-    @property
-    def clear_at_s(self) -> Array:
-        """When the fault will be cleared, inf while too hot or not faulted, [env, arm]."""
-        return self.arms["clear_at_s"]
-
-    @property
-    def moved_at_s(self) -> Array:
-        """When a person will move the faulted arm home, inf if it is there or not faulted, [env, arm]."""
-        return self.arms["moved_at_s"]
-
-    @property
-    def last_award(self) -> Array:
-        """1 the last claim was won, −1 lost, 0 none was made, int [env, arm]."""
-        return self.arms["last_award"]
-
-    @property
-    def absent(self) -> Array:
-        """FINISH_JOB, FINISH_CYCLE or BROKEN in an absence, else 0, int [env, arm]."""
-        return self.arms["absent"]
-
-    @property
-    def faults(self) -> Array:
-        """Count so far, int [env, arm]."""
-        return self.arms["faults"]
-
-    @property
-    def illegal(self) -> Array:
-        """Illegal actions so far, int [env, arm]."""
-        return self.arms["illegal"]
-
-    @property
-    def peak_c(self) -> Array:
-        """Hottest motor so far, [env, arm]."""
-        return self.arms["peak_c"]
-
-    @property
-    def above_warning_s(self) -> Array:
-        """[env, arm]."""
-        return self.arms["above_warning_s"]
-
-    @property
-    def busy_s(self) -> Array:
-        """Time away from home, [env, arm]."""
-        return self.arms["busy_s"]
-
-    @property
-    def lost_s(self) -> Array:
-        """Time faulted, [env, arm]."""
-        return self.arms["lost_s"]
-
-    @property
-    def energy_j(self) -> Array:
-        """Electrical energy turned to heat, [env, arm]. Over closed cycles mechanical work sums to zero."""
-        return self.arms["energy_j"]
-
-    @property
-    def kind(self) -> Array:
-        """Kind of job, int [env, job]."""
-        return self.jobs["kind"]
-
-    @property
-    def release_s(self) -> Array:
-        """[env, job]."""
-        return self.jobs["release_s"]
-
-    @property
-    def due_s(self) -> Array:
-        """[env, job]."""
-        return self.jobs["due_s"]
-
-    @property
-    def repetitions(self) -> Array:
-        """int [env, job]."""
-        return self.jobs["repetitions"]
-
-    @property
-    def expires(self) -> Array:
-        """Whether the job expires at its due date if no arm has begun it, bool [env, job]."""
-        return self.jobs["expires"]
-
-    @property
-    def status(self) -> Array:
-        """WAITING, RUNNING, DONE, GIVEN_UP or EXPIRED, int [env, job]."""
-        return self.jobs["status"]
-
-    @property
-    def queued_s(self) -> Array:
-        """When the job was released or last returned, [env, job]."""
-        return self.jobs["queued_s"]
-
-    @property
-    def cycles(self) -> Array:
-        """Cycles finished and kept, int [env, job]."""
-        return self.jobs["cycles"]
-
-    @property
-    def returns(self) -> Array:
-        """How many times a fault returned it to the queue, int [env, job]."""
-        return self.jobs["returns"]
-
-    @property
-    def finished_s(self) -> Array:
-        """NaN until done, [env, job]."""
-        return self.jobs["finished_s"]
+    mode = Column("arms", "mode")
+    """IDLE, WORKING or FAULTED, int [env, arm]."""
+    job = Column("arms", "job")
+    """Index of the current job, int [env, arm], −1 for none."""
+    plan = Column("arms", "plan")
+    """Row of the plan table along which the arm is away from home, int [env, arm]; −1 at home."""
+    progress_s = Column("arms", "progress_s")
+    """How far along it, in its time since leaving home, [env, arm]; a fault stops it."""
+    todo = Column("arms", "todo")
+    """Cycles the arm set out to do, int [env, arm]."""
+    clear_at_s = Column("arms", "clear_at_s")
+    """When the fault will be cleared, inf while too hot or not faulted, [env, arm]."""
+    moved_at_s = Column("arms", "moved_at_s")
+    """When a person will move the faulted arm home, inf if it is there or not faulted, [env, arm]."""
+    last_award = Column("arms", "last_award")
+    """1 the last claim was won, −1 lost, 0 none was made, int [env, arm]."""
+    absent = Column("arms", "absent")
+    """FINISH_JOB, FINISH_CYCLE or BROKEN in an absence, else 0, int [env, arm]."""
+    faults = Column("arms", "faults")
+    """Count so far, int [env, arm]."""
+    illegal = Column("arms", "illegal")
+    """Illegal actions so far, int [env, arm]."""
+    peak_c = Column("arms", "peak_c")
+    """Hottest motor so far, [env, arm]."""
+    above_warning_s = Column("arms", "above_warning_s")
+    """[env, arm]."""
+    busy_s = Column("arms", "busy_s")
+    """Time away from home, [env, arm]."""
+    lost_s = Column("arms", "lost_s")
+    """Time faulted, [env, arm]."""
+    energy_j = Column("arms", "energy_j")
+    """Electrical energy turned to heat, [env, arm]. Over closed cycles mechanical work sums to zero."""
+    kind = Column("jobs", "kind")
+    """Kind of job, int [env, job]."""
+    release_s = Column("jobs", "release_s")
+    """[env, job]."""
+    due_s = Column("jobs", "due_s")
+    """[env, job]."""
+    repetitions = Column("jobs", "repetitions")
+    """int [env, job]."""
+    expires = Column("jobs", "expires")
+    """Whether the job expires at its due date if no arm has begun it, bool [env, job]."""
+    status = Column("jobs", "status")
+    """WAITING, RUNNING, DONE, GIVEN_UP or EXPIRED, int [env, job]."""
+    queued_s = Column("jobs", "queued_s")
+    """When the job was released or last returned, [env, job]."""
+    cycles = Column("jobs", "cycles")
+    """Cycles finished and kept, int [env, job]."""
+    returns = Column("jobs", "returns")
+    """How many times a fault returned it to the queue, int [env, job]."""
+    finished_s = Column("jobs", "finished_s")
+    """NaN until done, [env, job]."""

@@ -15,7 +15,6 @@ from fleet.heat.thermal import (
     HOUSING,
     NODES,
     WINDING,
-    HousingObserver,
     ThermalModel,
     gen3_network,
     housing_observer,
@@ -269,16 +268,9 @@ def build_world(
         space = station_space  # the stations of these jobs depend on the plan
     volume, conflicts = space(plans) if space and plans else (np.zeros(max(1, len(plans)), int), np.zeros((1, 1), bool))
     work["volume"] = np.where(work["plan"] >= 0, volume[work["plan"]], 0)
-    rest, motors = [arm.rest_drive() for arm in arms], arms[0].motors
-    start = _records(
-        ARM,
-        len(arms),
-        current_sq=np.stack([each.current_sq for each in rest]),
-        friction_w=np.stack([each.friction_w for each in rest]),
-    )
-    start["mode"], start["plan"], start["job"], start["kind"] = IDLE, -1, -1, work.shape[1]
-    for name in ("phase_end_s", "clear_at_s", "moved_at_s"):
-        start[name] = np.inf
+    motors, learns = stack_motors([arm.motors for arm in arms]), all(arm.learns for arm in arms)
+    believed = [heating_of(*arm.beliefs, dt_s) if learns else np.zeros((), LAW) for arm in arms]
+    begin_c = [(arm, c, start_warm) for arm, c in zip(arms, ambient_c[0].tolist(), strict=True)]
     first, block, curve = forecast_arrays(stack_forecasts(forecasts) if forecasts else None, LANES).values()
     alike: dict[tuple[Work, ...], int] = {}
     tables = Tables(
@@ -294,12 +286,12 @@ def build_world(
         alpha_kt_per_k=float(motors.alpha_kt_per_k),
         reference_c=float(motors.reference_c),
         ambient_c=np.array(ambient_c, dtype=float)[None],
-        learns=all(arm.learns for arm in arms),
-        law=law_of(arms, dt_s)[None],
-        believed=_believed(arms, dt_s)[None],
-        modal=_modal(arms, ambient_c[0].tolist(), start_warm)[None],
-        start=start[None],
-        plans=_plan_table(driven),
+        learns=learns,
+        law=np.stack([law_of(arm, dt_s) for arm in arms])[None],
+        believed=np.stack(believed)[None],
+        modal=np.stack([_modal(*each) for each in begin_c])[None],
+        start=np.stack([_at_home(arm, no_kind=work.shape[1]) for arm in arms])[None],
+        plans=np.stack([_plan(each) for each in driven] or [np.zeros((), PLAN)]),
         excluded=bits(conflicts[volume]),
         work=work,
         forecast_first=first,
@@ -330,60 +322,62 @@ def station_space(plans: Sequence[Plan]) -> tuple[Array, Array]:
     return np.array(volume, dtype=int), needs.astype(int) @ needs.T > 0
 
 
-def law_of(arms: Sequence[Arm], dt_s: float) -> Array:
-    """How arms heat up, and what they estimate of it, in steps of a length, `LAW` [arm]."""
-    observers = (housing_observer(*arm.beliefs, dt_s) for arm in arms)
-    observer = HousingObserver(*(np.stack(parts) for parts in zip(*observers, strict=True)))
-    return _records(
-        LAW,
-        len(arms),
-        **_heating([arm.thermal for arm in arms], [arm.motors for arm in arms], dt_s),
-        housing_keep=observer.keep.swapaxes(-1, -2),
-        housing_gain=observer.gain.swapaxes(-1, -2),
+def law_of(arm: Arm, dt_s: float) -> Array:
+    """How an arm heats up, and what it estimates of it, in steps of a length, `LAW`."""
+    observer = housing_observer(*arm.beliefs, dt_s)
+    return _filled(
+        heating_of(arm.thermal, arm.motors, dt_s),
+        housing_keep=observer.keep.T,
+        housing_gain=observer.gain.T,
         housing_winding=observer.from_winding,
         housing_ambient=observer.from_ambient,
         housing_idle_w=observer.idle_w,
-        sensor_noise_k=np.stack([arm.motors.sensor_noise_k for arm in arms]),
-        drift_k_per_s=np.array([arm.drift_k_per_s for arm in arms]),
+        sensor_noise_k=arm.motors.sensor_noise_k,
+        drift_k_per_s=arm.drift_k_per_s,
     )
 
 
-def _believed(arms: Sequence[Arm], dt_s: float) -> Array:
-    """What the arms believe of their heat, if they learn, `LAW` [arm]."""
-    if not all(arm.learns for arm in arms):
-        return np.zeros(len(arms), LAW)
-    thermal, motors = zip(*(arm.beliefs for arm in arms), strict=True)
-    return _records(LAW, len(arms), **_heating([*thermal], [*motors], dt_s))
-
-
-def _heating(models: list[ThermalModel], motors: list[Motors], dt_s: float) -> dict[str, Array]:
-    thermal, stacked = stack_models(models), stack_motors(motors)
+def heating_of(thermal: ThermalModel, motors: Motors, dt_s: float) -> Array:
+    """How a network heats up in steps of a length: a `LAW` without estimates and sensors."""
     phi, gamma = thermal.step_matrices(dt_s)
-    return {
-        "step": np.concatenate([phi - np.eye(NODES), gamma], axis=-1).swapaxes(-1, -2),
-        "to_ambient": thermal.to_ambient,
-        "copper_w_per_a2": stacked.copper_w_per_a2,
-        "idle_w": stacked.idle_w,
-    }
+    return _filled(
+        np.zeros((), LAW),
+        step=np.concatenate([phi - np.eye(NODES), gamma], axis=-1).T,
+        to_ambient=thermal.to_ambient,
+        copper_w_per_a2=motors.copper_w_per_a2,
+        idle_w=motors.idle_w,
+    )
 
 
-def _modal(arms: Sequence[Arm], ambient_c: Sequence[float], start_warm: bool) -> Array:
-    """The thermal networks by their modes, and the temperatures at the start of a shift, `MODAL` [arm]."""
-    thermal = stack_models([arm.thermal for arm in arms])
-    start_c = [warm_start(a, c) if start_warm else np.full(NODES, c) for a, c in zip(arms, ambient_c, strict=True)]
-    housing_c = [
-        a.believed_housings(c) if start_warm else np.full(JOINTS, c) for a, c in zip(arms, ambient_c, strict=True)
-    ]
-    return _records(
-        MODAL,
-        len(arms),
+def _modal(arm: Arm, ambient_c: float, start_warm: bool) -> Array:
+    """The thermal network by its modes, and the temperatures at the start of a shift, `MODAL`."""
+    thermal = arm.thermal
+    return _filled(
+        np.zeros((), MODAL),
         root_capacity=np.sqrt(thermal.capacity),
         rates=thermal.rates,
         modes=thermal.modes,
         to_ambient=thermal.to_ambient,
-        idle_w=np.stack([arm.motors.idle_w for arm in arms]),
-        start_c=np.stack(start_c),
-        start_housing_c=np.stack(housing_c),
+        idle_w=arm.motors.idle_w,
+        start_c=warm_start(arm, ambient_c) if start_warm else np.full(NODES, ambient_c),
+        start_housing_c=arm.believed_housings(ambient_c) if start_warm else np.full(JOINTS, ambient_c),
+    )
+
+
+def _at_home(arm: Arm, no_kind: int) -> Array:
+    """The arm at the start of a shift, `ARM`; `no_kind` is the kind of no job."""
+    rest = arm.rest_drive()
+    return _filled(
+        np.zeros((), ARM),
+        mode=IDLE,
+        plan=-1,
+        job=-1,
+        kind=no_kind,
+        current_sq=rest.current_sq,
+        friction_w=rest.friction_w,
+        phase_end_s=np.inf,
+        clear_at_s=np.inf,
+        moved_at_s=np.inf,
     )
 
 
@@ -423,11 +417,10 @@ def _offers(
     return tuple(plans), driven, work, [forecast for _, forecast in forecasts.values()]
 
 
-def _plan_table(driven: Sequence[Driven]) -> Array:
-    if not driven:
-        return np.zeros(1, PLAN)
-    times_s, current_sq, friction_w, _, excess = map(np.array, zip(*driven, strict=True))
-    return _records(PLAN, len(driven), times_s=times_s, current_sq=current_sq, friction_w=friction_w, excess=excess)
+def _plan(driven: Driven) -> Array:
+    """A row of the plan table, `PLAN`."""
+    times_s, current_sq, friction_w, _, excess = driven
+    return _filled(np.zeros((), PLAN), times_s=times_s, current_sq=current_sq, friction_w=friction_w, excess=excess)
 
 
 def _stations(kinds: Sequence[Job]) -> Array:
@@ -463,9 +456,8 @@ def _shift_of(jobs: Sequence[Job], first_kind: int, absences: Array | None) -> S
     )
 
 
-def _records(kind: np.dtype, count: int, **fields: Array) -> Array:
-    """Records with the given fields, which are padded with zeros."""
-    made = np.zeros(count, kind)
+def _filled(record: Array, **fields: Array | float) -> Array:
+    """The record with some fields, whose values are padded with zeros."""
     for name, values in fields.items():
-        made[name][tuple(slice(0, n) for n in values.shape)] = values
-    return made
+        record[name][tuple(slice(0, n) for n in np.shape(values))] = values
+    return record

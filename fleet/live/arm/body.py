@@ -498,7 +498,7 @@ class SimulatedBody:
         # The engine counts its time in ticks of the new length, of which as many have passed.
         later_s = ticks * dt_s - before_s
         clear_at_s, moved_at_s = self._state.clear_at_s + later_s, self._state.moved_at_s + later_s
-        tables = self._world.tables._replace(dt_s=dt_s, law=law_of([self._arm], dt_s)[None])
+        tables = self._world.tables._replace(dt_s=dt_s, law=law_of(self._arm, dt_s)[None, None])
         self._world = replace(self._world, tables=tables)
         self._state = self._state.changed(tick=np.array([ticks]), clear_at_s=clear_at_s, moved_at_s=moved_at_s)
         self._dt_s = dt_s
