@@ -311,8 +311,10 @@ class ShiftFactory:
         """
         conditions = self.fleet.conditions(seed)
         jobs_seed, sensor_seed = shift_seeds(seed)
-        return replace(
-            self._sampler.shift(jobs_seed, conditions.arrivals, named=named),
+        return self._sampler.shift(
+            jobs_seed,
+            conditions.arrivals,
+            named=named,
             fleet=conditions.fleet,
             ambient_offset_k=conditions.ambient_k,
             noise_key=key_of(sensor_seed),

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -153,12 +154,15 @@ class JobSampler:
     def _kinds(self) -> list[Job]:
         return kinds_of(self._scenario)
 
-    def shift(self, seed: np.random.SeedSequence, rate: float = 1.0, *, named: bool = True) -> Shift:
+    def shift(
+        self, seed: np.random.SeedSequence, rate: float = 1.0, *, named: bool = True, **conditions: Any
+    ) -> Shift:  # of several types
         """The jobs of one shift in order of release, then of stream and number.
 
         Args:
             rate: Factor on the rates of Poisson streams and repeated batches.
             named: With the names of the jobs.
+            conditions: Other fields of the shift.
         """
         table = self._table
         if rate != 1.0:
@@ -181,6 +185,7 @@ class JobSampler:
             expires=self._expires[stream],
             after=after[:total],
             names=tuple(job_name(self._streams[i], n) for i, n in numbered),
+            **conditions,
         )
 
     def jobs(self, seed: np.random.SeedSequence, rate: float = 1.0) -> tuple[Job, ...]:
