@@ -239,6 +239,27 @@ def test_a_later_reward_is_worth_less(small):
     assert simulator.run(delayed, discount).reward[0] == later / 8
 
 
+def test_a_simulator_has_no_jobs_and_precedence_of_the_shift_before(small):
+    """Two jobs at once by two arms, simulated anew and after a look at a longer shift in which one awaits another."""
+    shifts, content = small.Shifts(arms=2), [small.work(place) for place in ("bench", "press")]
+    pair = [small.job("a", content[0]), small.job("b", content[1])]
+    chain = [pair[0], replace(pair[1], after=("a",)), small.job("c", content[0])]
+    kinds, _ = shifts.shop(chain)
+    waiting, free = (
+        replace(kinds, shifts=shifts.shop(jobs)[0].shifts) for jobs in (chain, pair)
+    )  # of the same three kinds of jobs
+    both = Schedules(np.array([[0, 1]]), np.zeros((1, 2), int), np.zeros((1, 2)), np.zeros((1, 2)))
+    results = []
+    for before in ([], [waiting]):
+        simulator = simulator_of(kinds)
+        for world in (*before, free):
+            engine, parts = begun(world)
+            simulator.look(engine, 0, seen_by(world, engine, parts))
+        results.append(simulator.run(both, np.ones(kinds.ticks)))
+    assert results[0].start_s.tolist() == results[1].start_s.tolist() == [[0.0, 0.0]]
+    assert results[0].reward == results[1].reward
+
+
 def test_where_there_is_no_simulator_an_error_says_so(small):
     assert [name for name, rule in RULES.items() if rule.plans] == ["mpc"]
     for name in ("mpc", "limited:mpc"):

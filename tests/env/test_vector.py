@@ -22,7 +22,7 @@ from fleet.env.vector import BatchEnv, Library, Shelf
 from fleet.motion import Plan
 from scenarios.evaluate.rollout import outcomes
 from scenarios.prepare.batch import library_of, make_batch
-from scenarios.prepare.fleet import Fleet, Randomisation, make_env, prepare
+from scenarios.prepare.fleet import Fleet, Randomisation, env_of, make_env, prepare, simulator_of_shift
 from scenarios.run.shift import run
 from scenarios.spec.jobs import draw_jobs
 from scenarios.spec.options import RunSpec
@@ -470,6 +470,23 @@ def test_rows_of_two_variants_equal_batches_of_each(cell, plans, play) -> None:
             break
     assert step > 10
     assert 0 < fleet.sum() < 12
+
+
+def test_the_single_env_and_its_simulator_are_those_of_the_variant_of_a_seed(cell, plans) -> None:
+    """And a reset of the same fleet draws a shift only: the tables stay."""
+    spread = {"spread": {"scale": 2.0, "seed": 9}}
+    fleet = prepare(cell, difficulty="oracle", cache=plans, randomise=Randomisation(variants=[spread]))
+    env, capacity, tables = env_of(fleet), [], set()
+    for seed in range(8):
+        variant = fleet.conditions(np.random.SeedSequence(seed)).fleet
+        env.reset(seed=seed)
+        expected = [arm.thermal.capacity for arm in fleet.all[variant].arms]
+        np.testing.assert_array_equal(env.world.thermal.capacity, expected)
+        simulated = simulator_of_shift(fleet, seed)._engine.tables.modal["root_capacity"][0]
+        np.testing.assert_allclose(simulated**2, expected)
+        capacity.append(float(expected[0][0]))
+        tables.add(id(env.batch.engine.tables))
+    assert len(set(capacity)) == len(tables) == 2
 
 
 def sparse(space: Space) -> Space:
