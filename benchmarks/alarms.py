@@ -23,22 +23,19 @@ from rich.console import Console
 from benchmarks.paper.harness import WIDEST, KeyedRows, Unit, compute, matching, mean_by_group, number, plain, table_of
 from fleet.arm.model import ArmModel
 from fleet.engine.shift import StepRecord, stack_records
-from fleet.engine.state import World
-from fleet.engine.world import Arm
+from fleet.engine.world import Arm, World
 from fleet.files import cache_folder
 from fleet.heat.motor import friction_torque, reference_current
 from fleet.heat.thermal import HOUSING, NODES, WINDING, temperature_steps
 from fleet.motion import RATE_HZ, Drive, Phase, Plan, drives
 from fleet.robot import GEN3, Robot
-from fleet.seeding import shift_seeds
 from scenarios.evaluate.statistics import Interval
 from scenarios.json_rows import Row, Rows
 from scenarios.policy_loader import OnBus, policy_at
-from scenarios.prepare.fleet import Fleet, env_of, prepare, with_surprises, world_of
+from scenarios.prepare.fleet import Fleet, ShiftFactory, env_of, prepare, with_surprises
 from scenarios.prepare.surprise import phase_with_load
 from scenarios.prepare.twins import train_twins
 from scenarios.progress import quiet
-from scenarios.spec.jobs import draw_jobs
 from scenarios.spec.schema import Scenario, SurpriseKind
 from scenarios.suite.instances import CELLS, Axes, SuiteCell, Surprising, scenario_of, surprises_in
 from scenarios.table import Table
@@ -165,13 +162,15 @@ def root_mean_square(values: Array) -> Array:
     return np.sqrt(np.square(values, dtype=float).mean(axis=0))
 
 
-def planned_temperatures(arm: Arm, a: int, world: World, record: StepRecord, plans: Sequence[Plan]) -> Array:
+def planned_temperatures(arm: Arm, a: int, world: World, record: StepRecord) -> Array:
     """Motor temperatures by the identified network after each step of the planned work, °C, [step, joint]."""
     thermal, motors = arm.beliefs
     rows, row = np.unique(record.plan[:, a], return_inverse=True)
     rest = arm.rest_drive(motors)
-    work = [drives([phase.profile for phase in plans[r].phases], motors) if r >= 0 else None for r in rows]
-    times_s = np.array([[phase.duration_s for phase in plans[r].phases] if r >= 0 else [0.0] * 3 for r in rows])[row]
+    work = [drives([phase.profile for phase in world.plans[r].phases], motors) if r >= 0 else None for r in rows]
+    times_s = np.array([[phase.duration_s for phase in world.plans[r].phases] if r >= 0 else [0.0] * 3 for r in rows])[
+        row
+    ]
     times_s[:, 1] *= record.todo[:, a]
     ends_s = np.cumsum(times_s, axis=1) - record.progress_s[:, a, None]
     inside_s = np.diff(np.clip(ends_s, 0.0, world.dt_s), axis=1, prepend=0.0)
@@ -185,9 +184,15 @@ def planned_temperatures(arm: Arm, a: int, world: World, record: StepRecord, pla
 
     loads = (Drive(sq, w) for sq, w in zip(mean("current_sq"), mean("friction_w"), strict=True))
     start_c = np.empty(NODES)
-    start_c[WINDING], start_c[HOUSING] = world.start_c[a, WINDING], world.start_housing_c[a]
+    modal = world.tables.modal[0, a]
+    start_c[WINDING], start_c[HOUSING] = modal["start_c"][WINDING], modal["start_housing_c"]
     course = temperature_steps(
-        loads, world.dt_s, motors=motors, thermal=thermal, start_c=start_c, ambient_c=float(world.ambient_c[0, a])
+        loads,
+        world.dt_s,
+        motors=motors,
+        thermal=thermal,
+        start_c=start_c,
+        ambient_c=float(world.tables.ambient_c[0, 0, a]),
     )
     return np.array([*course])[1:, WINDING]
 
@@ -209,8 +214,6 @@ class Shift:
 
     fleet: Fleet
     world: World
-    plans: Sequence[Plan]
-    """Behind the rows of the plan table."""
     record: StepRecord
     untrained: Sequence[Twin]
 
@@ -226,7 +229,7 @@ class Shift:
         fault_s = float(cut[0] * dt_s + record.cut_s[cut[0], a]) if len(cut) else np.inf
         steps = int(cut[0]) if len(cut) else len(record.tick)
         begun = np.flatnonzero((record.plan[:steps, a] >= 0) & (record.progress_s[:steps, a] == 0.0))
-        plans = [self.plans[row] for row in record.plan[begun, a]]
+        plans = [self.world.plans[row] for row in record.plan[begun, a]]
         taken_s = [plan.approach.duration_s + min(plan.cycle.duration_s, WATCHED_S) for plan in plans]
         known_s = begun * dt_s + np.array(taken_s)
         whole = np.flatnonzero(known_s <= steps * dt_s)
@@ -255,7 +258,7 @@ class Shift:
         arm, time_s = self.fleet.arms[a], (np.arange(steps) + 1) * self.world.dt_s
         true_c = self.record.end_c[:steps, a, WINDING]
         noise_k = arm.motors.sensor_noise_k * rng.standard_normal(true_c.shape)
-        planned_c = planned_temperatures(arm, a, self.world, self.record, self.plans)[:steps]
+        planned_c = planned_temperatures(arm, a, self.world, self.record)[:steps]
         off_k = true_c + noise_k + arm.drift_k_per_s * time_s[:, None] - planned_c
         each = round(MINUTE_S / self.world.dt_s)
         minutes = off_k[: steps // each * each].reshape(-1, each, off_k.shape[1])
@@ -289,8 +292,8 @@ def cell_rows(cell: SuiteCell, wanted: Collection[str]) -> KeyedRows:
     for key, (kind, role, seed) in shifts_of(cell).items():
         if key in wanted:
             own = with_surprises(replace(believing, scenario=scenario(kind, seed)))
-            world, plans = world_of(own, draw_jobs(own.scenario, shift_seeds(np.random.SeedSequence(seed))[0]))
-            shift = Shift(own, world, plans, work(own, seed), untrained)
+            world = ShiftFactory(own)(np.random.SeedSequence(seed)).world
+            shift = Shift(own, world, work(own, seed), untrained)
             random = np.random.SeedSequence([cell.seed, seed]).spawn(len(own.arms))
             arms = [shift.row(a, np.random.default_rng(each)) for a, each in enumerate(random)]
             yield key, {"cell": cell.name, "kind": kind, "role": role, "arms": arms}

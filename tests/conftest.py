@@ -17,9 +17,8 @@ import pytest
 from fleet.difficulty import Difficulty, DifficultyModel
 from fleet.engine.batch import RewardWeights, Shift
 from fleet.engine.profile_plant import ProfilePlant
-from fleet.engine.state import ABSENCE, World
-from fleet.engine.tables import tables_of
-from fleet.engine.world import Arm, Space, build_world
+from fleet.engine.state import ABSENCE
+from fleet.engine.world import Arm, Space, World, build_world
 from fleet.env.allocation_v2 import Episode
 from fleet.env.lookahead import CellSimulator
 from fleet.env.vector import BatchEnv, Library
@@ -168,7 +167,7 @@ def shop(
     if isinstance(arms, int):
         works = tuple(dict.fromkeys(j.work for jobs in shifts for j in jobs))
         arms = [arm(i, works) for i in range(arms)]
-    world, plans = build_world(
+    world = build_world(
         arms,
         shifts,
         limits=limits or ThermalLimits(),
@@ -182,7 +181,7 @@ def shop(
         absences=np.array(list(absences), ABSENCE),
     )
     rest_q = np.stack([a.robot.home_q() for a in arms])
-    return world, ProfilePlant(plans, rest_q, np.stack([a.rest_tau for a in arms]))
+    return world, ProfilePlant(world.plans, rest_q, np.stack([a.rest_tau for a in arms]))
 
 
 WORKS = tuple(work(place, payload) for place in ("bench", "press", "rack") for payload in (LIGHT, WARM, HOT))
@@ -257,7 +256,7 @@ class Shifts:
     def library(self) -> Library:
         """The same shifts for a batch."""
         world, _ = self.shop([job(str(k), work, repetitions=n, value=v) for k, (work, n, v) in enumerate(KINDS)])
-        return Library(world.arms, self.slots, tables_of(world)[0], AsArrays(self))
+        return Library(world.arms, self.slots, world.tables, AsArrays(self))
 
 
 KINDS = tuple((each, n, float(v)) for each in WORKS for n in range(1, 6) for v in range(1, 5))

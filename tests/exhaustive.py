@@ -4,10 +4,10 @@ from itertools import product
 
 import numpy as np
 
-from fleet.engine.batch import Engine, Parts, RewardWeights, empty_parts, shifts_of
-from fleet.engine.state import DONE, State, World
+from fleet.engine.batch import Engine, Parts, RewardWeights, empty_parts
+from fleet.engine.state import DONE, State
 from fleet.engine.step import FINISHED, TOTAL
-from fleet.engine.tables import tables_of
+from fleet.engine.world import World
 from fleet.observation import Layout
 from scenarios.evaluate.upper_bound import check_signs
 
@@ -36,12 +36,13 @@ def optimum(world: World, weights: RewardWeights, at_least: float = -np.inf) -> 
         ValueError: the shift is too large, or a weight has the wrong sign.
     """
     check_signs(weights)
-    tables, drawn = tables_of(world)
+    shift = world.shifts[0]
     layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
-    engine = Engine(tables, ROWS, layout, weights, jobs=world.jobs.exists.shape[1])
+    engine = Engine(world.tables, ROWS, layout, weights, jobs=world.jobs)
     rows, parts = np.arange(ROWS), empty_parts(layout, ROWS)
-    engine.reset(rows, shifts_of(drawn, [0])[:1] * ROWS)
-    value = weights.finished_value * np.where(world.jobs.exists[0], world.jobs.value[0], 0.0)
+    engine.reset(rows, [shift] * ROWS)
+    value = np.zeros(engine.state.jobs.shape[1])
+    value[: len(shift.kind)] = weights.finished_value * world.tables.value[0, shift.kind]
     states, rewards, best = [_state_of(engine.state, 0)], [0.0], at_least
     for _ in range(world.ticks):
         children: list[tuple[int, tuple[int, ...]]] = []

@@ -12,7 +12,8 @@ from fleet.arm.cell import ContactFinder
 from fleet.arm.model import build_cell, payload_bodies, set_payload_balls
 from fleet.engine.profile_plant import sample_row
 from fleet.engine.shift import StepRecord
-from fleet.engine.state import State, World
+from fleet.engine.state import State
+from fleet.engine.world import World
 from fleet.errors import FleetError
 from fleet.events import Event
 from fleet.heat.motor import friction_heat, reference_current
@@ -237,8 +238,8 @@ class MujocoPlant:
 
     def _samples(self, world: World) -> int:
         """Planned samples in a step."""
-        if world.envs != 1:
-            raise ValueError(f"MujocoPlant simulates one env (got {world.envs}); ProfilePlant takes any number.")
+        if len(world.shifts) != 1:
+            raise ValueError(f"MujocoPlant simulates one env (got {len(world.shifts)}); ProfilePlant takes any number.")
         if len(world.arms) != len(self._home_q):
             raise ValueError(f"MujocoPlant has {len(self._home_q)} arms, the world {len(world.arms)}.")
         samples = round(world.dt_s * RATE_HZ)

@@ -3,7 +3,7 @@
 Rows are reset here, and reward terms, named and weighted in the scenario, are summed here and reported apart.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, dataclass, field, fields
 from typing import Any
@@ -180,14 +180,10 @@ FEWEST_JOBS = 2
 """Arrays of one job would count as contiguous, which the kernels would be compiled for once more."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Shift:
     """What was drawn for one shift; arrays [job], in the order of release."""
 
-    fleet: int
-    """Which fleet of the tables."""
-    ambient_offset_k: float
-    """Added to the fleet's ambient temperature."""
     kind: Array
     release_s: Array
     due_s: Array
@@ -196,10 +192,16 @@ class Shift:
     """bool [job]."""
     after: Array
     """int [job, n], −1 for none."""
-    noise_key: int
+    fleet: int = 0
+    """Which fleet of the tables."""
+    ambient_offset_k: float = 0.0
+    """Added to the fleet's ambient temperature."""
+    noise_key: int = 0
     """Of the sensor noise, 64 bits; see `fleet.seeding`."""
     absences: Array = field(default_factory=no_absences)
     """Breaks and failures of the arms, `ABSENCE` [absence]."""
+    names: tuple[str, ...] = ()
+    """Of the jobs, for people; may be left out."""
 
 
 Parts = tuple[Array, Array]
@@ -355,7 +357,7 @@ class Engine:
     def reset(self, envs: Array, shifts: Sequence[Shift]) -> None:
         """Put a new shift into each of some rows; `observe` then gives what their arms know."""
         first = np.cumsum([0, *(len(shift.kind) for shift in shifts)])
-        most, room = max(shift.after.shape[1] for shift in shifts), self.state.jobs.shape[1]
+        most = max(shift.after.shape[1] for shift in shifts)
         after = np.concatenate([_widen(shift.after, most) for shift in shifts])
         waits = int((after >= 0).sum(axis=1).max(initial=0))
         after = -np.sort(-after, axis=1)[:, :waits]
@@ -364,8 +366,7 @@ class Engine:
         absences = np.zeros((len(shifts), longest), ABSENCE)
         for row, shift in zip(absences, shifts, strict=True):
             row[: len(shift.absences)] = shift.absences
-        if jobs > room or waits > self.state.after.shape[2] or longest > self.state.absences.shape[1]:
-            self._make_room(jobs, waits, longest)
+        self._make_room(jobs, waits, longest)
 
         def of_all(name: str) -> Array:
             return np.concatenate([getattr(shift, name) for shift in shifts])
@@ -382,7 +383,14 @@ class Engine:
         """Put what the arms of some envs know now into `out`, and what has become of them into `infos`."""
         self._run(OFFER + OBSERVE, _NO_ACTIONS, np.empty((self.envs, OUTCOME)), envs, out)
 
-    def step(self, actions: Array | None, out: Parts, until: Array | None = None) -> Array:
+    def step(
+        self,
+        actions: Array | None,
+        out: Parts,
+        until: Array | None = None,
+        *,
+        drive: Callable[[State], Drive] | None = None,
+    ) -> Array:
         """One decision interval of every env, or more.
 
         Args:
@@ -391,35 +399,29 @@ class Engine:
             out: Receives what the arms know afterwards.
             until: Go on while no arm has a `choice`, to this tick at most, int64 [env]. The events and the trace are
                 then those of the last interval alone.
+            drive: Returns the mean heat drive over the coming interval, each [env, arm, joint], from the state with the
+                awards made; without it the arms move as planned.
 
         Returns:
             Outcomes, [env, OUTCOME]: weighted reward terms, and the columns of `fleet.engine.step.OUTCOME`.
         """
-        self._clear_events()
-        if actions is None:
-            return self._stepped(MOVE + OFFER + OBSERVE, _NO_ACTIONS, out, until)
-        return self._stepped(CLAIM + MOVE + OFFER + OBSERVE, actions, out, until)
+        self._simulation.events.used[0] = 0
+        claims = CLAIM if actions is not None else 0
+        actions = _NO_ACTIONS if actions is None else actions
+        if drive is not None:
+            if claims:
+                self._run(claims, actions, _no_terms(self.envs), self._all, _NO_VECTORS)
+            self._keep_drive(drive(self.state))
+            claims = 0
+        return self._stepped(claims + MOVE + OFFER + OBSERVE, actions, out, until)
 
-    def claim(self, actions: Array | None) -> None:
-        """The first part of `step` alone: award jobs. `move` must follow."""
-        self._clear_events()
-        if actions is not None:
-            self._run(CLAIM, actions, _no_terms(self.envs), self._all, _NO_VECTORS)
-
-    def move(self, drive: Drive, out: Parts) -> Array:
-        """The rest of `step`, for arms that were seen to move.
-
-        Args:
-            drive: Mean heat drive over the step, each [env, arm, joint].
-            out: As in `step`, like the result.
-        """
+    def _keep_drive(self, drive: Drive) -> None:
         measured = self._simulation.drive
         if not len(measured):
             measured = np.zeros((self.envs, self.layout.arms), DRIVE)
             self._simulation = self._simulation._replace(drive=measured)
             self._prepare()
         measured["current_sq"][..., :JOINTS], measured["friction_w"][..., :JOINTS] = drive.current_sq, drive.friction_w
-        return self._stepped(MOVE + OFFER + OBSERVE, _NO_ACTIONS, out)
 
     def play(self, schedules: Plans, discount: Array) -> Script:
         """Execute one schedule in each of the first rows, from the present state to the end of the shift.
@@ -452,9 +454,6 @@ class Engine:
                 each.result()
         return terms
 
-    def _clear_events(self) -> None:
-        self._simulation.events.used[0] = 0
-
     def _run(
         self,
         parts: int,
@@ -469,12 +468,14 @@ class Engine:
         self._step(self._bundles[thread], parts, actions, terms, until, rows, *out)
 
     def load(self, state: State) -> None:
-        """Take over a state with at most as many jobs, and what follows from it."""
-        jobs = state.jobs.shape[1]
-        self.state.env[:], self.state.arms[:] = state.env, state.arms
-        self.state.jobs[:, :jobs], self.state.failed_arm[:, :jobs] = state.jobs, state.failed_arm
-        self.state.absences["kind"] = 0
-        self.state.absences[:, : state.absences.shape[1]] = state.absences
+        """Take over a state, of one env for all or of each, and what follows from it."""
+        jobs, waits, absences = state.jobs.shape[1], state.after.shape[2], state.absences.shape[1]
+        self._make_room(jobs, waits, absences)
+        mine = self.state
+        mine.env[:], mine.arms[:] = state.env, state.arms
+        mine.jobs[:, :jobs], mine.failed_arm[:, :jobs] = state.jobs, state.failed_arm
+        mine.after[:, :jobs], mine.absences["kind"] = -1, 0
+        mine.after[:, :jobs, :waits], mine.absences[:, :absences] = state.after, state.absences
         self.refresh()
 
     def refresh(self) -> None:
@@ -507,14 +508,18 @@ class Engine:
         for e, a in np.argwhere(state.mode == WORKING).tolist():
             set_phase(self.tables.plans, state.arms[e, a])
 
-    def _make_room(self, jobs: int, waits: int, absences: int = 0) -> None:
+    def _make_room(self, jobs: int, waits: int, absences: int) -> None:
         """For more jobs a shift, a tenth more than asked for, or absences, keeping what is there."""
+        room, now = self.state.jobs.shape[1], self.state
+        if jobs > room or waits > now.after.shape[2] or absences > now.absences.shape[1]:
+            jobs = jobs + jobs // 10 if jobs > room else room
+            self._move(jobs, max(now.after.shape[2], waits), max(now.absences.shape[1], absences))
+
+    def _move(self, jobs: int, waits: int, absences: int) -> None:
+        """Move the state to arrays with room for these."""
         before = self._simulation
-        room = before.state.jobs.shape[1]
-        jobs = jobs + jobs // 10 if jobs > room else room
         envs, arms = before.state.arms.shape
-        absences = max(before.state.absences.shape[1], absences)
-        state = empty_state(envs, arms, jobs, max(before.state.after.shape[2], waits), absences)
+        state = empty_state(envs, arms, jobs, waits, absences)
         events = event_buffer(envs * (arms * PER_ARM + jobs) if len(before.events.what) else 0)
         for new, old in zip((*state, *events), (*before.state, *before.events), strict=True):
             new[tuple(slice(0, n) for n in old.shape)] = old
@@ -526,7 +531,8 @@ class Engine:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self._make_room(0, 0)  # unpickled arrays no longer lie job by job; prepares too
+        now = self.state  # its unpickled arrays no longer lie job by job
+        self._move(now.jobs.shape[1], now.after.shape[2], now.absences.shape[1])
 
 
 _NO_ACTIONS = np.zeros((0, 0), np.int64)
@@ -539,22 +545,3 @@ def _no_terms(envs: int) -> Array:
 
 def _widen(after: Array, waits: int) -> Array:
     return np.pad(after, ((0, 0), (0, waits - after.shape[1])), constant_values=-1)
-
-
-def shifts_of(state: State, noise_keys: Sequence[int]) -> list[Shift]:
-    """The shifts of a world as `tables_of` gives it, with the keys of their sensor noise."""
-    return [
-        Shift(
-            fleet=int(state.fleet[e]),
-            ambient_offset_k=float(state.env["ambient_offset_k"][e]),
-            kind=state.kind[e, :count],
-            release_s=state.release_s[e, :count],
-            due_s=state.due_s[e, :count],
-            repetitions=state.repetitions[e, :count],
-            expires=state.expires[e, :count],
-            after=state.after[e, :count],
-            noise_key=key,
-            absences=state.absences[e],
-        )
-        for e, (count, key) in enumerate(zip(state.number.tolist(), noise_keys, strict=True))
-    ]

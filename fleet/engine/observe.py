@@ -10,7 +10,7 @@ from fleet.difficulty import KNOWN, probability_of
 from fleet.engine.claims import is_closed
 from fleet.engine.corrections import line_of
 from fleet.engine.crossings import hottest
-from fleet.engine.state import BROKEN, LANES
+from fleet.engine.state import LANES
 from fleet.engine.tables import Simulation, Tables
 from fleet.jit import Real, jit_inline, nonnegative
 from fleet.observation import FIELDS, LONG_S
@@ -194,24 +194,14 @@ def show_members(
 
 
 @jit_inline
-def break_in(sim: Simulation, e: int, a: int) -> Real:
-    """Time until an arm's next break begins, 0 during one; failures are not known before."""
-    s, soon = sim.state, _LONG_S
-    for n in range(s.absences.shape[1]):
-        each = s.absences[e, n]
-        if each["arm"] == a and 0 < each["kind"] < BROKEN and each["end"] > s.env[e]["tick"]:
-            soon = min(soon, max(np.float32((each["begin"] - s.env[e]["tick"]) * sim.tables.dt_s), _ZERO))
-    return soon
-
-
-@jit_inline
 def show_arm(sim: Simulation, e: int, a: int, mine: Array, measured_c: Array, hottest_c: Real, busy_s: Real) -> None:
     """Put what an arm knows of itself into its part."""
     t, arm, at, unit = sim.tables, sim.state.arms[e, a], sim.form.offsets, sim.form.inverse
     mine[at.working] = _ONE if arm["mode"] == WORKING else _ZERO
     mine[at.faulted] = _ONE if arm["mode"] == FAULTED else _ZERO
     mine[at.busy_s], mine[at.last_award] = busy_s * unit.busy_s, np.float32(arm["last_award"])
-    mine[at.break_in_s] = break_in(sim, e, a) * unit.break_in_s
+    break_in_s = np.float32((arm["break_tick"] - sim.state.env[e]["tick"]) * t.dt_s)  # failures are not known before
+    mine[at.break_in_s] = min(max(break_in_s, _ZERO), _LONG_S) * unit.break_in_s
     for k in range(JOINTS):
         mine[at.temp_c + k] = min(max(measured_c[k], LOW_C), HIGH_C) * unit.temp_c
         mine[at.housing_c + k] = min(max(arm["housing_c"][k], LOW_C), HIGH_C) * unit.housing_c

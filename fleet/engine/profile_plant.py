@@ -6,7 +6,8 @@ from functools import cached_property
 import numpy as np
 
 from fleet.engine.shift import StepRecord
-from fleet.engine.state import State, World
+from fleet.engine.state import State
+from fleet.engine.world import World
 from fleet.events import Event
 from fleet.heat.motor import current
 from fleet.heat.thermal import HOUSING, WINDING
@@ -147,7 +148,7 @@ def telemetry_of(world: World, record: StepRecord, offsets_s: Array, motion: Arr
     working = (record.mode[:, None] == WORKING) & (moments < home_s)
 
     time_s = record.tick[:, None] * world.dt_s + offsets_s  # [step, sample]
-    drift_k = (time_s[..., None] * world.drift_k_per_s)[..., None]
+    drift_k = (time_s[..., None] * np.array([arm.drift_k_per_s for arm in world.fleet]))[..., None]
 
     def flat(values: Array) -> Array:
         return values.reshape(-1, *values.shape[2:])

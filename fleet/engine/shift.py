@@ -1,23 +1,26 @@
-"""What arms tell each other over an exchange, and how it enters their observations.
+"""What happens in shifts besides the engine.
 
-One shift, step by step: the engine with one row, a plant, an exchange, an event log and a watcher.
+What arms tell each other over an exchange, how they move, events and records of single steps, and steps by themselves.
 """
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache, partial
 from typing import Protocol
 
 import numpy as np
 
 from fleet.bus.exchange.memory import Broadcast, Exchange, PeerView
-from fleet.engine.batch import Engine, Parts, RewardWeights, empty_parts, shifts_of
-from fleet.engine.state import State, World
-from fleet.engine.tables import TRACE, events_of, tables_of
-from fleet.events import Event
+from fleet.engine.batch import Engine, Parts, RewardWeights, Shift, empty_parts
+from fleet.engine.state import State
+from fleet.engine.tables import AWARD, FAILURE, FAULT, GIVE_UP, RETURN, TRACE, EventBuffer
+from fleet.engine.world import World
+from fleet.events import Event, EventKind
 from fleet.motion import Drive
 from fleet.observation import LONG_S, Layout
-from fleet.seeding import exchange_seed, key_of
+from fleet.robot import GEN3
+from fleet.seeding import key_of
 from fleet.telemetry import FAULTED, WORKING
 
 Array = np.ndarray
@@ -165,149 +168,101 @@ class Episode:
         """Key of the sensors' noise; see `fleet.seeding`."""
         return key_of(self.sensors)
 
+    @property
+    def shift(self) -> Shift:
+        """As the engine has it, with the noise of its sensors."""
+        return replace(self.world.shifts[0], noise_key=self.noise_key)
+
+    @property
+    def drive(self) -> Callable[[State], Drive] | None:
+        """Heat drive of the coming step, from the state with the awards made; None if arms move as planned."""
+        return None if self.plant.follows_plans else partial(self.plant.drive, self.world)
+
 
 EpisodeFactory = Callable[[np.random.SeedSequence], Episode]
 """Makes the episode of a seed; the fleet must be the same for every seed."""
 Watch = Callable[[StepRecord], None]
 
 
-class ShiftRunner:
-    """Steps one shift.
+def events_of(world: World, state: State, buffer: EventBuffer) -> Iterator[Event]:
+    """The events of the step that led to `state`; releases of jobs come last.
 
     Args:
-        exchange: Carries what arms tell each other; perfect and immediate if not given.
-        keep_events: Collect events in `events`.
-        watch: Called with the record of every step.
-        layout: Of the observation; all peers if not given.
-        compiled: As in `Engine`.
+        state: After the step.
     """
-
-    def __init__(
-        self,
-        episode: Episode,
-        weights: RewardWeights,
-        *,
-        exchange: Exchange | None = None,
-        keep_events: bool = False,
-        watch: Watch | None = None,
-        layout: Layout | None = None,
-        compiled: bool | None = None,
-    ) -> None:
-        world = episode.world
-        self._episode, self._watch = episode, watch
-        at_once = exchange is None or exchange.perfect
-        layout = layout or Layout(len(world.arms), world.slots, plans=world.plans_per_job)
-        layout = replace(layout, delivered=not at_once)
-        self._reports_contacts = keep_events and not episode.plant.follows_plans
-        self._exchange = None if at_once else exchange
-        self._delivered_before = 0
-        if self._exchange is not None:
-            self._exchange.begin(np.random.default_rng(exchange_seed(episode.sensors)))
-            self._delivered_before = self._exchange.delivered
-        self.events: list[Event] = []
-        tables, drawn = tables_of(world)
-        room = world.jobs.exists.shape[1]
-        trace = watch is not None or self._reports_contacts
-        self._engine = Engine(tables, 1, layout, weights, jobs=room, events=keep_events, trace=trace, compiled=compiled)
-        self._engine.reset(_FIRST, shifts_of(drawn, [episode.noise_key]))
-        self._parts = empty_parts(layout, 1)
-        self._engine.observe(_FIRST, self._parts)
-        self._deliver()
-
-    @cached_property
-    def state(self) -> State:
-        """The simulator's state, [1, ...]; views that the next step overwrites."""
-        return _without_room(self._engine.state, self._episode.world)
-
-    def __getstate__(self) -> dict[str, object]:
-        return {name: value for name, value in vars(self).items() if name != "state"}  # a copy has views of its own
-
-    @property
-    def layout(self) -> Layout:
-        """Of the observation."""
-        return self._engine.layout
-
-    @property
-    def parts(self) -> Parts:
-        """What the arms know, float32 [shared] and [arm, own]; the next step overwrites it."""
-        return self._parts[0][0], self._parts[1][0]
-
-    @property
-    def mask(self) -> Array:
-        """Legal actions, int8 [arm, option + 2]; the next step overwrites it."""
-        return self._engine.mask[0]
-
-    @property
-    def choice(self) -> bool:
-        """Whether an arm may claim a job, or one at work has just passed the warning limit."""
-        return bool(self._engine.choice[0])
-
-    @property
-    def slot_job(self) -> Array:
-        """Jobs in the slots, int [slot], −1 for an empty one; the next step overwrites it."""
-        return self._engine.offers.slot_job[0]
-
-    @property
-    def messages(self) -> int:
-        """Messages delivered to a peer."""
-        if self._exchange is not None:
-            return self._exchange.delivered - self._delivered_before
-        return self.layout.arms * (self.layout.arms - 1) * (self.tick + 1)
-
-    @property
-    def infos(self) -> list[tuple[float, float, float, float]]:
-        """Faults, illegal actions, hottest motor, °C, and s above the warning limit of each arm so far."""
-        return self._engine.infos[0].tolist()
-
-    @property
-    def tick(self) -> int:
-        """Decision intervals that are over."""
-        return int(self._engine.state.tick[0])
-
-    @property
-    def engine(self) -> Engine:
-        """The engine, with one row."""
-        return self._engine
-
-    def step(self, actions: Array | None) -> Array:
-        """One decision interval; returns its outcome, [OUTCOME], as `Engine.step` does.
-
-        Args:
-            actions: int64 [arm]. None: no claims, and the outcome of the last ones remains.
-        """
-        engine, world, plant = self._engine, self._episode.world, self._episode.plant
-        chosen = None if actions is None else actions[None]
-        outcome = _stepped(engine, world, plant, chosen, self._parts)[0]
-        if len(engine.events.what):
-            self.events += events_of(world, engine.state, engine.events)
-        if self._reports_contacts:
-            self.events += plant.contacts(world, record_of(engine))
-        if self._watch is not None:
-            self._watch(record_of(engine))
-        self._deliver()
-        return outcome
-
-    def _deliver(self) -> None:
-        """Replace what the arms observe of their peers by what the exchange delivered."""
-        if self._exchange is not None:
-            names, twins = self._episode.world.jobs.names[0], self._episode.twins
-            deliver(self._exchange, self._engine, self._parts, names, twins)
+    count = int(buffer.used[0])
+    what, numbers = buffer.what[:count], buffer.numbers[:count]
+    began_s = (state.tick - 1) * world.dt_s
+    # What becomes of the job follows the fault of its arm.
+    phase = np.where(np.isin(what[:, 0], (FAILURE, RETURN, GIVE_UP)), FAULT, what[:, 0])
+    for row in np.lexsort((what[:, 2], what[:, 1], phase)).tolist():
+        kind, e, a, j, joint = what[row].tolist()
+        offset_s, value = numbers[row].tolist()
+        plan, joint = (joint, -1) if kind == AWARD else (-1, joint)
+        name, measured, reason = _described(world, state, kind, e, j, joint, value)
+        common = {"time_s": float(began_s[e] + offset_s), "env": e, "arm": world.arms[a] if a >= 0 else ""}
+        common["job"] = world.shifts[e].names[j] if j >= 0 else ""
+        yield Event(kind=name, joint=joint + 1, value=measured, reason=reason, **common)
+        if kind == AWARD:
+            peak, most = world.fleet[a].driven(world.plans[plan])[3], GEN3.torque_warning
+            over = peak - np.array(most)
+            if (over > 0).any():
+                k = int(over.argmax())
+                text = f"joint {k + 1} reaches {peak[k]:.1f} N·m, warning at {most[k]:.1f}"
+                yield Event(kind="torque_warning", joint=k + 1, value=float(peak[k]), reason=text, **common)
+    yield from _releases(world, state)
 
 
-_FIRST = np.zeros(1, dtype=int)
+def _described(
+    world: World, state: State, kind: int, e: int, j: int, joint: int, value: float
+) -> tuple[EventKind, float, str]:
+    """Name, value and reason of an event."""
+    tables = world.tables
+    match kind:
+        case 0:
+            return "award", value, ""
+        case 1:
+            return "lost", math.nan, "another arm claimed it, its station or the space"
+        case 2:
+            return "illegal", math.nan, "action outside the mask: a wait"
+        case 3:
+            return "warning", tables.warning_c, f"joint {joint + 1} passed {tables.warning_c:g} °C"
+        case 4:
+            late_s = max(0.0, float(state.finished_s[e, j] - world.shifts[e].due_s[j]))
+            return "finish", late_s, f"late by {late_s:.0f} s" if late_s else "on time"
+        case 5:
+            return "home", math.nan, ""
+        case 6:
+            return "fault", tables.error_c, f"joint {joint + 1} passed {tables.error_c:g} °C"
+        case 7:
+            return "return", value, f"{state.cycles[e, j]} of {state.repetitions[e, j]} cycles kept"
+        case 8:
+            return "give_up", value, f"{state.returns[e, j]} faults; {state.cycles[e, j]} cycles done"
+        case 10:
+            return "moved", math.nan, "moved home by a person"
+        case 11:
+            return "give_back", value, f"{state.cycles[e, j]} of {state.repetitions[e, j]} cycles kept"
+        case 12:
+            return "expire", math.nan, "its due date passed before an arm began it"
+        case 13:
+            return "failure", value, f"not by heat; repaired after {value:.0f} s"
+        case 14:
+            return "break", value, f"for {value:.0f} s"
+        case 15:
+            return "break_end", math.nan, ""
+        case _:
+            return "recover", math.nan, f"every motor below {tables.restart_c:g} °C and the fault cleared"
 
 
-def _stepped(engine: Engine, world: World, plant: Plant, actions: Array | None, out: Parts) -> Array:
-    if plant.follows_plans:
-        return engine.step(actions, out)
-    engine.claim(actions)
-    return engine.move(plant.drive(world, engine.state), out)
-
-
-def _without_room(state: State, world: World) -> State:
-    """Views of the state with as many jobs as the world has; an engine may have room for more."""
-    jobs = world.jobs.exists.shape[1]
-    return state.of_jobs(slice(0, jobs))
+def _releases(world: World, state: State) -> Iterator[Event]:
+    for e, (shift, tick) in enumerate(zip(world.shifts, state.tick.tolist(), strict=True)):
+        start_s = (tick - 1) * world.dt_s
+        new = (shift.release_s > start_s) & (shift.release_s <= start_s + world.dt_s)
+        if start_s == 0:  # also the jobs that are there from the beginning
+            new |= shift.release_s == 0
+        for j in np.flatnonzero(new).tolist():
+            at_s = start_s + (float(shift.release_s[j]) - start_s)
+            yield Event(time_s=at_s, kind="release", env=e, arm="", job=shift.names[j])
 
 
 def record_of(engine: Engine, env: int = 0) -> StepRecord:
@@ -354,34 +309,35 @@ def step(
     """
     engine, out = _engine_of(world, compiled)
     engine.load(before)
-    engine.observe(np.arange(world.envs), out)  # offers of this state
-    _stepped(engine, world, plant, np.ascontiguousarray(actions, dtype=np.int64), out)
+    engine.observe(np.arange(engine.envs), out)  # offers of this state
+    drive = None if plant.follows_plans else partial(plant.drive, world)
+    engine.step(np.ascontiguousarray(actions, dtype=np.int64), out, drive=drive)
     if log is not None:
         log += events_of(world, engine.state, engine.events)
-    return Stepped(_without_room(engine.state, world).copy(), _recorded(engine, before.tick.copy()))
+    return Stepped(engine.state.copy(jobs=slice(world.jobs)), _recorded(engine, before.tick.copy()))
 
 
 def initial(world: World) -> State:
     """Every arm at home, at its start temperature; every job waiting."""
     engine, _ = _engine_of(world, False)
-    engine.reset(np.arange(world.envs), shifts_of(tables_of(world)[1], [0] * world.envs))
-    return _without_room(engine.state, world).copy()
+    engine.reset(np.arange(engine.envs), world.shifts)
+    return engine.state.copy(jobs=slice(world.jobs))
 
 
 def open_jobs(world: World, state: State, *, compiled: bool | None = None) -> tuple[Array, Array]:
     """Jobs in the slots, int [env, slot], and legal actions, int8 [env, arm, option + 2], in a state."""
     engine, out = _engine_of(world, compiled)
     engine.load(state)
-    engine.observe(np.arange(world.envs), out)
+    engine.observe(np.arange(engine.envs), out)
     return engine.offers.slot_job.copy(), engine.mask.copy()
 
 
 @lru_cache(maxsize=4)
 def _engine_of(world: World, compiled: bool | None) -> tuple[Engine, Parts]:
     """An engine for a world, and room for its observations."""
-    tables, drawn = tables_of(world)
-    layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
-    room = world.jobs.exists.shape[1]
-    engine = Engine(tables, world.envs, layout, RewardWeights(), jobs=room, events=True, trace=True, compiled=compiled)
-    engine.reset(np.arange(world.envs), shifts_of(drawn, [0] * world.envs))
-    return engine, empty_parts(layout, world.envs)
+    envs, layout = len(world.shifts), Layout(len(world.arms), world.slots, plans=world.plans_per_job)
+    engine = Engine(
+        world.tables, envs, layout, RewardWeights(), jobs=world.jobs, events=True, trace=True, compiled=compiled
+    )
+    engine.reset(np.arange(envs), world.shifts)
+    return engine, empty_parts(layout, envs)

@@ -1,18 +1,14 @@
-"""The simulator's two values: what is fixed for a shift (`World`) and what changes (`State`).
+"""What changes in the simulator during a shift.
 
 Arrays have a leading env axis [env, ...]; a single shift is env = 1.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
 
-from fleet.difficulty import Forecast
-from fleet.heat.motor import Motors
-from fleet.heat.thermal import NODES, HousingObserver, ThermalModel
-from fleet.motion import Drive
-from fleet.robot import JOINTS, ThermalLimits
+from fleet.heat.thermal import NODES
+from fleet.robot import JOINTS
 
 Array = np.ndarray
 
@@ -28,137 +24,6 @@ ABSENCE = np.dtype([("arm", "i4"), ("begin", "i4"), ("end", "i4"), ("kind", "i4"
 def no_absences() -> Array:
     """Absences of a shift without any, `ABSENCE` [0]."""
     return np.zeros(0, ABSENCE)
-
-
-@dataclass(frozen=True, eq=False)
-class JobTable:
-    """The jobs of each env as arrays; rows beyond an env's jobs have `exists` False."""
-
-    names: tuple[tuple[str, ...], ...]
-    """[env][job]."""
-    exists: Array
-    """bool [env, job]."""
-    release_s: Array
-    due_s: Array
-    value: Array
-    payload_kg: Array
-    repetitions: Array
-    """int [env, job]."""
-    after: Array
-    """Indices of the jobs that must be done first, int [env, job, n], −1 for none."""
-    expires: Array
-    """Whether the job expires at its due date if no arm has begun it, bool [env, job]."""
-    alike: Array
-    """Jobs of one work have the same number: what is measured in one holds for all, int [env, job]."""
-    stations: Array
-    """Indices of the stations it occupies, int [env, job, n], −1 for none."""
-
-
-@dataclass(frozen=True, eq=False)
-class PlanTable:
-    """The distinct plans as arrays; phases are approach, cycle, retreat."""
-
-    times_s: Array
-    """Duration of each phase, [plan, phase]."""
-    current_sq: Array
-    """Mean squared reference current, A², [plan, phase, joint]."""
-    friction_w: Array
-    """Mean friction heat, W, [plan, phase, joint]."""
-    peak_tau: Array
-    """Largest torque magnitude, N·m, [plan, joint]."""
-    volume: Array
-    """Index of the space that the arm takes, int [plan]."""
-    excess: Array
-    """Heat of a cycle that the arm measures over that which it expects, less 1, [plan]."""
-
-
-@dataclass(frozen=True, eq=False)
-class Offers:
-    """The plans of each arm for each job, the fastest first, and their scores."""
-
-    plan: Array
-    """Row of the `PlanTable`, int [env, arm, job, plan]; −1 where the arm has none."""
-    difficulty: Array
-    """d, [env, arm, job, plan]; NaN where there is no score."""
-    p_saturation: Array
-    """Probability from models that ignore the start temperature, [env, arm, job, plan]; NaN where unknown."""
-    risk: Array
-    """Row of `forecasts` for P, int [env, arm, job, plan]; −1 where the model has none."""
-    peak: Array
-    """Row of `forecasts` for the peak temperature, int [env, arm, job, plan]; −1 where the model has none."""
-    forecasts: Forecast | None
-    """[forecast, ...]; None where no model of the fleet has any."""
-
-
-@dataclass(frozen=True, eq=False)
-class Law:
-    """How arms heat up in a decision interval, arrays [arm, ...]."""
-
-    motors: Motors
-    thermal: ThermalModel
-    phi: Array
-    gamma: Array
-    """Step matrices, [arm, node, node]."""
-
-
-@dataclass(frozen=True, eq=False)
-class World:
-    """Everything that does not change during a shift."""
-
-    arms: tuple[str, ...]
-    stations: tuple[str, ...]
-    dt_s: float
-    """Decision interval: the length of one step."""
-    ticks: int
-    """Steps until the horizon."""
-    slots: int
-    """Jobs on offer at a time, K."""
-    ambient_c: Array
-    """Ambient temperature at each arm during each tick, °C, [tick, arm]."""
-    thermal: ThermalModel
-    """[arm, ...]."""
-    motors: Motors
-    """[arm, joint]."""
-    limits: ThermalLimits
-    torque_warning: Array
-    """N·m, [joint]."""
-    rest: Drive
-    """Heat drive of standing in the home posture, [arm, joint]."""
-    plans: PlanTable
-    jobs: JobTable
-    offers: Offers
-    conflicts: Array
-    """Whether two arms cannot take two volumes at a time, bool [volume, volume]."""
-    observer: HousingObserver
-    """How each arm estimates its housing temperatures, [arm, ...]."""
-    start_c: Array
-    """Temperatures at the start of the shift, [arm, node]."""
-    start_housing_c: Array
-    """Estimates of the housing temperatures at the start, [arm, joint]."""
-    phi: Array
-    gamma: Array
-    """Step matrices for `dt_s`, [arm, node, node]."""
-    drift_k_per_s: Array
-    """Drift of the readings of motor temperatures from the start of the shift, [arm]."""
-    believed: Law | None
-    """What the arms believe of their heat, if they learn: see `fleet.engine.world.Arm.learns`."""
-    absences: Array
-    """Breaks and failures of the arms in every env, `ABSENCE` [absence]."""
-
-    @property
-    def horizon_s(self) -> float:
-        """Length of the shift, s."""
-        return self.ticks * self.dt_s
-
-    @property
-    def plans_per_job(self) -> int:
-        """Plans that an arm may have for a job."""
-        return self.offers.plan.shape[-1]
-
-    @property
-    def envs(self) -> int:
-        """Number of parallel shifts."""
-        return len(self.jobs.exists)
 
 
 LANES = JOINTS + 1
@@ -189,14 +54,16 @@ ARM = np.dtype(
         ("last_award", "i1"),
         ("pending", "?"),
         ("absent", "i1"),
-        ("unused", "i1", 8),
+        ("break_tick", "i4"),
+        ("unused", "i1", 4),
     ],
     align=True,
 )
 """All that changes of an arm, four cache lines, the last of which is all that claims need; see the properties of
 `State`. `current_sq` and `friction_w` are the heat drive of the present phase of its plan, which ends when `progress_s`
 is `phase_end_s`; `kind` is that of its job, and `pending` whether the job is still to be finished (False on the way
-home). `absent` is the kind of the present absence, 0 for none."""
+home). `absent` is the kind of the present absence, 0 for none, and
+`break_tick` when the next break begins, or the present one began."""
 
 JOB = np.dtype(
     [
@@ -240,6 +107,17 @@ is the tick at which the next absence begins or ends. `alarm`: an arm at work ha
 step."""
 
 
+class Column:
+    """A field of the records of a `State`, as an array."""
+
+    def __init__(self, records: str, name: str) -> None:
+        self._records, self._name = records, name
+
+    def __get__(self, state: "State", owner: type) -> Array:
+        """View of the field in all records."""
+        return getattr(state, self._records)[self._name]
+
+
 class State(NamedTuple):
     """All that changes during the shifts; kernels write into the records, whose fields the properties show."""
 
@@ -276,169 +154,79 @@ class State(NamedTuple):
 
     def named(self) -> dict[str, Array]:
         """The properties by name."""
-        return {name: getattr(self, name) for name, kind in vars(State).items() if isinstance(kind, property)}
+        return {name: getattr(self, name) for name, kind in vars(State).items() if isinstance(kind, property | Column)}
 
-    @property
-    def tick(self) -> Array:
-        """Decision intervals that are over, int [env]."""
-        return self.env["tick"]
-
-    @property
-    def fleet(self) -> Array:
-        """Which fleet of the tables, int [env]."""
-        return self.env["fleet"]
-
-    @property
-    def number(self) -> Array:
-        """Number of jobs, int [env]."""
-        return self.env["number"]
-
-    @property
-    def unfinished(self) -> Array:
-        """Jobs neither done nor given up, int [env]."""
-        return self.env["unfinished"]
+    tick = Column("env", "tick")
+    """Decision intervals that are over, int [env]."""
+    fleet = Column("env", "fleet")
+    """Which fleet of the tables, int [env]."""
+    number = Column("env", "number")
+    """Number of jobs, int [env]."""
+    unfinished = Column("env", "unfinished")
+    """Jobs neither done nor given up, int [env]."""
 
     @property
     def done(self) -> Array:
         """Jobs done, int [env]."""
         return self.env["number"] - self.env["unfinished"] - self.env["given_up"]
 
-    @property
-    def temp_c(self) -> Array:
-        """[env, arm, node]."""
-        return self.arms["temp_c"]
+    temp_c = Column("arms", "temp_c")
+    """[env, arm, node]."""
 
     @property
     def housing_c(self) -> Array:
         """What each arm estimates its housing temperatures to be, [env, arm, joint]."""
         return self.arms["housing_c"][..., :JOINTS]
 
-    @property
-    def mode(self) -> Array:
-        """IDLE, WORKING or FAULTED, int [env, arm]."""
-        return self.arms["mode"]
-
-    @property
-    def job(self) -> Array:
-        """Index of the current job, int [env, arm], −1 for none."""
-        return self.arms["job"]
-
-    @property
-    def plan(self) -> Array:
-        """Row of the plan table along which the arm is away from home, int [env, arm]; −1 at home."""
-        return self.arms["plan"]
-
-    @property
-    def progress_s(self) -> Array:
-        """How far along it, in its time since leaving home, [env, arm]; a fault stops it."""
-        return self.arms["progress_s"]
-
-    @property
-    def todo(self) -> Array:
-        """Cycles the arm set out to do, int [env, arm]."""
-        return self.arms["todo"]
-
-    @property
-    def clear_at_s(self) -> Array:
-        """When the fault will be cleared, inf while too hot or not faulted, [env, arm]."""
-        return self.arms["clear_at_s"]
-
-    @property
-    def moved_at_s(self) -> Array:
-        """When a person will move the faulted arm home, inf if it is there or not faulted, [env, arm]."""
-        return self.arms["moved_at_s"]
-
-    @property
-    def last_award(self) -> Array:
-        """1 the last claim was won, −1 lost, 0 none was made, int [env, arm]."""
-        return self.arms["last_award"]
-
-    @property
-    def absent(self) -> Array:
-        """FINISH_JOB, FINISH_CYCLE or BROKEN in an absence, else 0, int [env, arm]."""
-        return self.arms["absent"]
-
-    @property
-    def faults(self) -> Array:
-        """Count so far, int [env, arm]."""
-        return self.arms["faults"]
-
-    @property
-    def illegal(self) -> Array:
-        """Illegal actions so far, int [env, arm]."""
-        return self.arms["illegal"]
-
-    @property
-    def peak_c(self) -> Array:
-        """Hottest motor so far, [env, arm]."""
-        return self.arms["peak_c"]
-
-    @property
-    def above_warning_s(self) -> Array:
-        """[env, arm]."""
-        return self.arms["above_warning_s"]
-
-    @property
-    def busy_s(self) -> Array:
-        """Time away from home, [env, arm]."""
-        return self.arms["busy_s"]
-
-    @property
-    def lost_s(self) -> Array:
-        """Time faulted, [env, arm]."""
-        return self.arms["lost_s"]
-
-    @property
-    def energy_j(self) -> Array:
-        """Electrical energy turned to heat, [env, arm]. Over closed cycles mechanical work sums to zero."""
-        return self.arms["energy_j"]
-
-    @property
-    def kind(self) -> Array:
-        """Kind of job, int [env, job]."""
-        return self.jobs["kind"]
-
-    @property
-    def release_s(self) -> Array:
-        """[env, job]."""
-        return self.jobs["release_s"]
-
-    @property
-    def due_s(self) -> Array:
-        """[env, job]."""
-        return self.jobs["due_s"]
-
-    @property
-    def repetitions(self) -> Array:
-        """int [env, job]."""
-        return self.jobs["repetitions"]
-
-    @property
-    def expires(self) -> Array:
-        """Whether the job expires at its due date if no arm has begun it, bool [env, job]."""
-        return self.jobs["expires"]
-
-    @property
-    def status(self) -> Array:
-        """WAITING, RUNNING, DONE, GIVEN_UP or EXPIRED, int [env, job]."""
-        return self.jobs["status"]
-
-    @property
-    def queued_s(self) -> Array:
-        """When the job was released or last returned, [env, job]."""
-        return self.jobs["queued_s"]
-
-    @property
-    def cycles(self) -> Array:
-        """Cycles finished and kept, int [env, job]."""
-        return self.jobs["cycles"]
-
-    @property
-    def returns(self) -> Array:
-        """How many times a fault returned it to the queue, int [env, job]."""
-        return self.jobs["returns"]
-
-    @property
-    def finished_s(self) -> Array:
-        """NaN until done, [env, job]."""
-        return self.jobs["finished_s"]
+    mode = Column("arms", "mode")
+    """IDLE, WORKING or FAULTED, int [env, arm]."""
+    job = Column("arms", "job")
+    """Index of the current job, int [env, arm], −1 for none."""
+    plan = Column("arms", "plan")
+    """Row of the plan table along which the arm is away from home, int [env, arm]; −1 at home."""
+    progress_s = Column("arms", "progress_s")
+    """How far along it, in its time since leaving home, [env, arm]; a fault stops it."""
+    todo = Column("arms", "todo")
+    """Cycles the arm set out to do, int [env, arm]."""
+    clear_at_s = Column("arms", "clear_at_s")
+    """When the fault will be cleared, inf while too hot or not faulted, [env, arm]."""
+    moved_at_s = Column("arms", "moved_at_s")
+    """When a person will move the faulted arm home, inf if it is there or not faulted, [env, arm]."""
+    last_award = Column("arms", "last_award")
+    """1 the last claim was won, −1 lost, 0 none was made, int [env, arm]."""
+    absent = Column("arms", "absent")
+    """FINISH_JOB, FINISH_CYCLE or BROKEN in an absence, else 0, int [env, arm]."""
+    faults = Column("arms", "faults")
+    """Count so far, int [env, arm]."""
+    illegal = Column("arms", "illegal")
+    """Illegal actions so far, int [env, arm]."""
+    peak_c = Column("arms", "peak_c")
+    """Hottest motor so far, [env, arm]."""
+    above_warning_s = Column("arms", "above_warning_s")
+    """[env, arm]."""
+    busy_s = Column("arms", "busy_s")
+    """Time away from home, [env, arm]."""
+    lost_s = Column("arms", "lost_s")
+    """Time faulted, [env, arm]."""
+    energy_j = Column("arms", "energy_j")
+    """Electrical energy turned to heat, [env, arm]. Over closed cycles mechanical work sums to zero."""
+    kind = Column("jobs", "kind")
+    """Kind of job, int [env, job]."""
+    release_s = Column("jobs", "release_s")
+    """[env, job]."""
+    due_s = Column("jobs", "due_s")
+    """[env, job]."""
+    repetitions = Column("jobs", "repetitions")
+    """int [env, job]."""
+    expires = Column("jobs", "expires")
+    """Whether the job expires at its due date if no arm has begun it, bool [env, job]."""
+    status = Column("jobs", "status")
+    """WAITING, RUNNING, DONE, GIVEN_UP or EXPIRED, int [env, job]."""
+    queued_s = Column("jobs", "queued_s")
+    """When the job was released or last returned, [env, job]."""
+    cycles = Column("jobs", "cycles")
+    """Cycles finished and kept, int [env, job]."""
+    returns = Column("jobs", "returns")
+    """How many times a fault returned it to the queue, int [env, job]."""
+    finished_s = Column("jobs", "finished_s")
+    """NaN until done, [env, job]."""

@@ -482,8 +482,11 @@ def turn_absences(sim: Simulation, e: int) -> None:
             env["turn"] = min(env["turn"], each["end"])
     for a in range(nonnegative(s.arms.shape[1])):
         arm, kind, end = s.arms[e, a], 0, 0
+        arm["break_tick"] = NEVER
         for n in range(s.absences.shape[1]):
             each = s.absences[e, n]
+            if each["arm"] == a and 0 < each["kind"] < BROKEN and each["end"] > env["tick"]:
+                arm["break_tick"] = min(arm["break_tick"], each["begin"])
             if each["arm"] == a and each["begin"] <= env["tick"] < each["end"] and each["kind"] > kind:
                 kind, end = each["kind"], each["end"]
         before, left_s = arm["absent"], (end - env["tick"]) * t.dt_s

@@ -7,21 +7,18 @@ numbers, which are turned into `Event`s for reports.
 """
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from fleet.difficulty import KNOWN, extend_curve, forecast_arrays
-from fleet.engine.state import ABSENCE, ARM, ENV, JOB, LANES, State, World
-from fleet.events import Event, EventKind
-from fleet.heat.motor import Motors
+from fleet.engine.state import ABSENCE, ARM, ENV, JOB, LANES, State
 from fleet.heat.thermal import NODES
 from fleet.jit import jit
 from fleet.job import MOST_FAULTS
 from fleet.observation import FIELDS, Layout, Offsets
 from fleet.robot import JOINTS
-from fleet.telemetry import IDLE
 
 Array = np.ndarray
 
@@ -58,87 +55,6 @@ def record_event(
     events.what[row, 3], events.what[row, 4] = job, joint
     events.numbers[row, 0], events.numbers[row, 1] = offset_s, value
     events.used[0] = row + 1
-
-
-def events_of(world: World, state: State, buffer: EventBuffer) -> Iterator[Event]:
-    """The events of the step that led to `state`; releases of jobs come last.
-
-    Args:
-        state: After the step.
-    """
-    count = int(buffer.used[0])
-    what, numbers = buffer.what[:count], buffer.numbers[:count]
-    began_s = (state.tick - 1) * world.dt_s
-    # What becomes of the job follows the fault of its arm.
-    phase = np.where(np.isin(what[:, 0], (FAILURE, RETURN, GIVE_UP)), FAULT, what[:, 0])
-    for row in np.lexsort((what[:, 2], what[:, 1], phase)).tolist():
-        kind, e, a, j, joint = what[row].tolist()
-        offset_s, value = numbers[row].tolist()
-        plan, joint = (joint, -1) if kind == AWARD else (-1, joint)
-        name, measured, reason = _described(world, state, kind, e, j, joint, value)
-        common = {"time_s": float(began_s[e] + offset_s), "env": e, "arm": world.arms[a] if a >= 0 else ""}
-        common["job"] = world.jobs.names[e][j] if j >= 0 else ""
-        yield Event(kind=name, joint=joint + 1, value=measured, reason=reason, **common)
-        if kind == AWARD:
-            peak = world.plans.peak_tau[plan]
-            over = peak - world.torque_warning
-            if (over > 0).any():
-                k = int(over.argmax())
-                text = f"joint {k + 1} reaches {peak[k]:.1f} N·m, warning at {world.torque_warning[k]:.1f}"
-                yield Event(kind="torque_warning", joint=k + 1, value=float(peak[k]), reason=text, **common)
-    yield from _releases(world, state)
-
-
-def _described(
-    world: World, state: State, kind: int, e: int, j: int, joint: int, value: float
-) -> tuple[EventKind, float, str]:
-    """Name, value and reason of an event."""
-    limits = world.limits
-    match kind:
-        case 0:
-            return "award", value, ""
-        case 1:
-            return "lost", math.nan, "another arm claimed it, its station or the space"
-        case 2:
-            return "illegal", math.nan, "action outside the mask: a wait"
-        case 3:
-            return "warning", limits.warning_c, f"joint {joint + 1} passed {limits.warning_c:g} °C"
-        case 4:
-            late_s = max(0.0, float(state.finished_s[e, j] - world.jobs.due_s[e, j]))
-            return "finish", late_s, f"late by {late_s:.0f} s" if late_s else "on time"
-        case 5:
-            return "home", math.nan, ""
-        case 6:
-            return "fault", limits.error_c, f"joint {joint + 1} passed {limits.error_c:g} °C"
-        case 7:
-            return "return", value, f"{state.cycles[e, j]} of {world.jobs.repetitions[e, j]} cycles kept"
-        case 8:
-            return "give_up", value, f"{state.returns[e, j]} faults; {state.cycles[e, j]} cycles done"
-        case 10:
-            return "moved", math.nan, "moved home by a person"
-        case 11:
-            return "give_back", value, f"{state.cycles[e, j]} of {world.jobs.repetitions[e, j]} cycles kept"
-        case 12:
-            return "expire", math.nan, "its due date passed before an arm began it"
-        case 13:
-            return "failure", value, f"not by heat; repaired after {value:.0f} s"
-        case 14:
-            return "break", value, f"for {value:.0f} s"
-        case 15:
-            return "break_end", math.nan, ""
-        case _:
-            return "recover", math.nan, f"every motor below {limits.restart_c:g} °C and the fault cleared"
-
-
-def _releases(world: World, state: State) -> Iterator[Event]:
-    start_s = ((state.tick - 1) * world.dt_s)[:, None]
-    release_s = world.jobs.release_s
-    # The first step also takes the jobs that are there from the beginning.
-    new = world.jobs.exists & (release_s <= start_s + world.dt_s)
-    new &= (release_s > start_s) | ((start_s == 0) & (release_s == 0))
-    for e, j in np.argwhere(new).tolist():
-        at_s = float(start_s[e, 0]) + (float(release_s[e, j]) - float(start_s[e, 0]))
-        yield Event(time_s=at_s, kind="release", env=e, arm="", job=world.jobs.names[e][j])
 
 
 WIDE = 16
@@ -185,7 +101,7 @@ PLAN = np.dtype(
     align=True,
 )
 """Durations and mean heat drives of the phases of a plan: approach, one cycle, retreat; then the excess of heat that
-its arm measures; see `PlanTable`."""
+its arm measures over that which it expects, less 1."""
 
 WORK = np.dtype(
     [(name, "f4") for name in ("travel_s", "cycle_s", "difficulty", "p_saturation")]
@@ -198,7 +114,7 @@ it has none; the volume that the plan takes, counted for each fleet."""
 
 
 class Tables(NamedTuple):
-    """What does not change from shift to shift; see `World` for the meaning."""
+    """What does not change from shift to shift."""
 
     dt_s: float
     ticks: int
@@ -281,6 +197,11 @@ moved before a fault stopped it, the whole step if none did; heat until the faul
 
 DRIVE = np.dtype([("current_sq", "f4", LANES), ("friction_w", "f4", LANES)])
 """Mean heat drive of an arm over a step, from a plant that computes the motion, [lane]."""
+
+
+def drive_of(records: Array) -> tuple[Array, Array]:
+    """Mean squared currents and friction heat in records of arms or plans, each [..., joint]."""
+    return records["current_sq"][..., :JOINTS].astype(float), records["friction_w"][..., :JOINTS].astype(float)
 
 
 INFO = np.dtype([("faults", "f8"), ("illegal", "f8"), ("peak_c", "f8"), ("above_warning_s", "f8")])
@@ -439,122 +360,6 @@ def form_of(layout: Layout, *, shares_heat: bool) -> Form:
     return Form(offsets, scales, layout.members, alike, ahead_s, bids, tells)
 
 
-def tables_of(world: World) -> tuple[Tables, State]:
-    """A world as tables, in which each env is a fleet and each job a kind, and its shifts before the start."""
-    envs, jobs = world.envs, world.jobs
-    count = jobs.exists.sum(axis=1)
-    if not np.array_equal(jobs.exists, np.arange(jobs.exists.shape[1]) < count[:, None]):
-        raise ValueError("The jobs of an env must be the first of its row.")
-
-    def records(kind: np.dtype, shape: tuple[int, ...], **fields: Array) -> Array:
-        made = np.zeros(shape, kind)
-        for name, values in fields.items():
-            place = made[name]
-            place[tuple(slice(0, n) for n in (*shape, *values.shape[values.ndim - place.ndim + len(shape) :]))] = values
-        return made
-
-    limits, motors, offers, rest = world.limits, world.motors, world.offers, world.rest
-    observer, thermal, arms = world.observer, world.thermal, len(world.arms)
-
-    def heating(phi: Array, gamma: Array, to_ambient: Array, of: Motors) -> dict[str, Array]:
-        step = np.concatenate([phi - np.eye(NODES), gamma], axis=-1).swapaxes(-1, -2)
-        return {"step": step, "to_ambient": to_ambient, "copper_w_per_a2": of.copper_w_per_a2, "idle_w": of.idle_w}
-
-    law = records(
-        LAW,
-        (arms,),
-        **heating(world.phi, world.gamma, thermal.to_ambient, motors),
-        housing_keep=observer.keep.swapaxes(-1, -2),
-        housing_gain=observer.gain.swapaxes(-1, -2),
-        housing_winding=observer.from_winding,
-        housing_ambient=observer.from_ambient,
-        housing_idle_w=observer.idle_w,
-        sensor_noise_k=motors.sensor_noise_k,
-        drift_k_per_s=world.drift_k_per_s,
-    )
-    believed = np.zeros(arms, LAW)
-    if known := world.believed:
-        believed = records(LAW, (arms,), **heating(known.phi, known.gamma, known.thermal.to_ambient, known.motors))
-    modal = records(
-        MODAL,
-        (arms,),
-        root_capacity=np.sqrt(thermal.capacity),
-        rates=thermal.rates,
-        modes=thermal.modes,
-        to_ambient=thermal.to_ambient,
-        idle_w=motors.idle_w,
-        start_c=world.start_c,
-        start_housing_c=world.start_housing_c,
-    )
-    start = records(
-        ARM,
-        (arms,),
-        current_sq=rest.current_sq,
-        friction_w=rest.friction_w,
-    )
-    start["mode"], start["plan"], start["job"], start["kind"] = IDLE, -1, -1, jobs.exists.shape[1]
-    for name in ("phase_end_s", "clear_at_s", "moved_at_s"):
-        start[name] = np.inf
-    can = offers.plan >= 0
-    times_s = np.where(can[..., None], world.plans.times_s[offers.plan], 0.0)
-    work = np.zeros(can.shape, WORK)
-    work["travel_s"], work["cycle_s"] = times_s[..., 0] + times_s[..., 2], times_s[..., 1]
-    work["difficulty"], work["p_saturation"] = offers.difficulty, offers.p_saturation
-    work["risk"], work["peak"], work["plan"] = offers.risk, offers.peak, offers.plan
-    work["volume"] = np.where(can, world.plans.volume[offers.plan], 0)
-    plans = records(
-        PLAN,
-        (len(world.plans.times_s),),
-        times_s=world.plans.times_s,
-        current_sq=world.plans.current_sq,
-        friction_w=world.plans.friction_w,
-        excess=world.plans.excess,
-    )
-
-    def per_fleet(values: Array) -> Array:
-        return np.repeat(values[None], envs, axis=0)
-
-    first, block, curve = forecast_arrays(offers.forecasts, LANES).values()
-    tables = Tables(
-        dt_s=float(world.dt_s),
-        ticks=int(world.ticks),
-        warning_c=float(limits.warning_c),
-        error_c=float(limits.error_c),
-        restart_c=float(limits.restart_c),
-        clear_s=float(limits.clear_s),
-        move_home_s=float(limits.move_home_s),
-        power_off=bool(limits.power_off_on_fault),
-        alpha_cu_per_k=float(motors.alpha_cu_per_k),
-        alpha_kt_per_k=float(motors.alpha_kt_per_k),
-        reference_c=float(motors.reference_c),
-        ambient_c=per_fleet(world.ambient_c),
-        learns=world.believed is not None,
-        law=per_fleet(law),
-        believed=per_fleet(believed),
-        modal=per_fleet(modal),
-        start=per_fleet(start),
-        plans=plans,
-        excluded=bits(world.conflicts[world.plans.volume]),
-        work=work.swapaxes(1, 2),
-        forecast_first=first,
-        forecast_block=block.astype(np.float32),
-        forecast_curve=curve.astype(np.float32),
-        least=np.nan_to_num(np.fmin.reduce(work["difficulty"], axis=-1), nan=-1.0).swapaxes(-1, -2),
-        stations=bits(_one_hot(jobs.stations, len(world.stations))),
-        payload_kg=jobs.payload_kg,
-        value=jobs.value,
-        alike=jobs.alike,
-    )
-    state = empty_state(envs, arms, jobs.exists.shape[1], jobs.after.shape[2], len(world.absences))
-    state.absences[:] = world.absences
-    state.env["fleet"], state.env["number"] = np.arange(envs), count
-    state.jobs["kind"] = np.arange(jobs.exists.shape[1])
-    for name in ("release_s", "due_s", "repetitions", "expires"):
-        state.jobs[name] = getattr(jobs, name)
-    state.after[:] = jobs.after
-    return owned(tables), state
-
-
 def empty_state(envs: int, arms: int, jobs: int, waits: int, absences: int = 0) -> State:
     """Room for a number of jobs, each of which waits for up to `waits` others, and of absences; there are none yet."""
     state = State(
@@ -596,14 +401,6 @@ def bits(flags: Array) -> Array:
     words = max(1, -(-flags.shape[-1] // 64))
     packed = np.packbits(pad(flags, size=64 * words, fill=False), axis=-1, bitorder="little")
     return np.ascontiguousarray(packed).view("<u8").astype(np.uint64)
-
-
-def _one_hot(stations: Array, count: int) -> Array:
-    """Which stations each kind of job occupies, bool [fleet, kind + 1, station]; the last row, no job, has none."""
-    flags = np.zeros((stations.shape[0], stations.shape[1] + 1, count), bool)
-    fleet, kind, n = np.nonzero(stations >= 0)
-    flags[fleet, kind, stations[fleet, kind, n]] = True
-    return flags
 
 
 _FORECAST = tuple(forecast_arrays(None, LANES))

@@ -1,4 +1,4 @@
-"""From nouns to arrays: the plan table, the offers of every arm for every job, and the world of a shift."""
+"""From nouns to arrays: arms with their plans, and jobs, as the tables and shifts of the engine."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -6,13 +6,15 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from fleet.difficulty import Difficulty, DifficultyModel, Forecast, stack_forecasts
-from fleet.engine.state import JobTable, Law, Offers, PlanTable, World, no_absences
+from fleet.difficulty import Difficulty, DifficultyModel, Forecast, forecast_arrays, stack_forecasts
+from fleet.engine.batch import Shift
+from fleet.engine.state import ARM, LANES, no_absences
+from fleet.engine.tables import LAW, MODAL, PLAN, WORK, Tables, bits, owned
 from fleet.heat.motor import Motors, gen3_motors, stack_motors
 from fleet.heat.thermal import (
     HOUSING,
+    NODES,
     WINDING,
-    HousingObserver,
     ThermalModel,
     gen3_network,
     housing_observer,
@@ -24,13 +26,18 @@ from fleet.heat.thermal import (
 from fleet.job import Job, Work, check_precedence
 from fleet.motion import Drive, Plan, drive
 from fleet.offered_plans import PLANS, offered_plans
-from fleet.robot import GEN3, Robot, ThermalLimits
+from fleet.robot import JOINTS, Robot, ThermalLimits
+from fleet.telemetry import IDLE
 
 Array = np.ndarray
 CYCLES_S = 900.0
 """Time after which rises of the hottest motor are compared: that of a typical job, before its housing has settled."""
 Space = Callable[[Sequence[Plan]], tuple[Array, Array]]
 """Volume of each plan, int [plan], and which volumes two arms cannot take at a time, bool [volume, volume]."""
+
+Driven = tuple[Array, Array, Array, Array, float]
+"""Of a plan: durations, s, [phase], mean squared current and friction heat, [phase, joint], largest torques, [joint],
+and what its arm measures of `excess`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +78,7 @@ class Arm:
         return {}
 
     @cached_property
-    def _driven(self) -> dict[int, tuple[Plan, tuple[Array, Array, Array, Array, float]]]:
+    def _driven(self) -> dict[int, tuple[Plan, Driven]]:
         return {}
 
     def offers(self, *works: Work) -> "ScoredPlans":
@@ -81,9 +88,8 @@ class Arm:
             self._offered[works] = ScoredPlans(self.model, variants)
         return self._offered[works]
 
-    def driven(self, plan: Plan) -> tuple[Array, Array, Array, Array, float]:
-        """Of one of its plans: durations, s, [phase], mean squared current and friction heat, [phase, joint], largest
-        torques, [joint], and what it measures of `excess`."""
+    def driven(self, plan: Plan) -> Driven:
+        """What one of its plans does to its motors."""
         if id(plan) not in self._driven:  # with the plan itself, so that its id stays its own
             phases = self.executed.get(plan, plan).phases
             times_s = np.array([phase.duration_s for phase in phases])
@@ -162,6 +168,76 @@ def warm_start(arm: Arm, ambient_c: float) -> Array:
     return known.copy()
 
 
+@dataclass(frozen=True, eq=False)
+class World:
+    """A fleet and its shifts, one in each env: the arrays of the engine, and what stands behind them."""
+
+    fleet: tuple[Arm, ...]
+    slots: int
+    """Jobs on offer at a time, K."""
+    kinds: tuple[Job, ...]
+    """A job of each kind of the tables."""
+    plans: tuple[Plan, ...]
+    """Those of the rows of the plan table."""
+    tables: Tables
+    """With one fleet."""
+    shifts: tuple[Shift, ...]
+    """Of each env."""
+
+    @cached_property
+    def arms(self) -> tuple[str, ...]:
+        """Names of the arms."""
+        return tuple(arm.robot.name for arm in self.fleet)
+
+    @cached_property
+    def motors(self) -> Motors:
+        """[arm, joint]."""
+        return stack_motors([arm.motors for arm in self.fleet])
+
+    @cached_property
+    def thermal(self) -> ThermalModel:
+        """[arm, ...]."""
+        return stack_models([arm.thermal for arm in self.fleet])
+
+    @property
+    def stations(self) -> tuple[str, ...]:
+        """Names of the stations of all jobs."""
+        return stations_of(self.kinds)
+
+    @property
+    def dt_s(self) -> float:
+        """Decision interval: the length of one step."""
+        return self.tables.dt_s
+
+    @property
+    def ticks(self) -> int:
+        """Steps until the horizon."""
+        return self.tables.ticks
+
+    @property
+    def horizon_s(self) -> float:
+        """Length of a shift, s."""
+        return self.ticks * self.dt_s
+
+    @property
+    def plans_per_job(self) -> int:
+        """Plans that an arm may have for a job."""
+        return self.tables.work.shape[3]
+
+    @cached_property
+    def conflicts(self) -> Array:
+        """Whether two arms cannot be away along two plans at a time, bool [plan, plan]."""
+        work, volume = self.tables.work, np.zeros(len(self.tables.plans), int)
+        volume[work["plan"][work["plan"] >= 0]] = work["volume"][work["plan"] >= 0]
+        taken = np.unpackbits(self.tables.excluded.view(np.uint8), axis=1, bitorder="little")
+        return taken[:, volume] > 0
+
+    @property
+    def jobs(self) -> int:
+        """Largest number of jobs of a shift, at least 1."""
+        return max(1, *(len(shift.kind) for shift in self.shifts))
+
+
 def build_world(
     arms: Sequence[Arm],
     shifts: Sequence[Sequence[Job]],
@@ -175,8 +251,8 @@ def build_world(
     space: Space | None = None,
     plans_per_job: int = PLANS,
     absences: Array | None = None,
-) -> tuple[World, tuple[Plan, ...]]:
-    """The world of one or more parallel shifts, and the plans behind the rows of its plan table.
+) -> World:
+    """The world of one or more parallel shifts, in which each job is a kind of its own.
 
     Args:
         shifts: The jobs of each env.
@@ -184,45 +260,57 @@ def build_world(
         start_warm: Arms begin at their idle equilibrium rather than at ambient.
         space: Which plans of two arms would touch; none if not given.
         plans_per_job: Most plans that an arm offers for a job.
-        absences: Breaks and failures, `ABSENCE` [absence]; none if not given.
+        absences: Breaks and failures in each env, `ABSENCE` [absence]; none if not given.
     """
-    motors, thermal, rest, phi, gamma, observer, believed = _laws(tuple(arms), dt_s)
-    plans, offers = _offers(arms, shifts, plans_per_job)
-    if space is None and any(job.alternatives for jobs in shifts for job in jobs):
+    kinds = tuple(job for jobs in shifts for job in jobs)
+    plans, driven, work, forecasts = _offers(arms, kinds, plans_per_job)
+    if space is None and any(job.alternatives for job in kinds):
         space = station_space  # the stations of these jobs depend on the plan
     volume, conflicts = space(plans) if space and plans else (np.zeros(max(1, len(plans)), int), np.zeros((1, 1), bool))
-    start = np.repeat(ambient_c[0][:, None], thermal.capacity.shape[-1], axis=1)
-    housing_c = np.repeat(ambient_c[0][:, None], len(GEN3.velocity), axis=1)
-    if start_warm:
-        housing_c = np.stack([a.believed_housings(c) for a, c in zip(arms, ambient_c[0].tolist(), strict=True)])
-        start = np.stack([warm_start(a, c) for a, c in zip(arms, ambient_c[0].tolist(), strict=True)])
-    stations = tuple(dict.fromkeys(name for jobs in shifts for job in jobs for name in job.stations))
-    world = World(
-        arms=tuple(arm.robot.name for arm in arms),
-        stations=stations,
-        dt_s=dt_s,
-        ticks=ticks,
-        slots=slots,
-        ambient_c=ambient_c,
-        thermal=thermal,
-        motors=motors,
-        limits=limits,
-        torque_warning=np.array(GEN3.torque_warning),
-        rest=rest,
-        plans=_plan_table(plans, {arm.robot.name: arm for arm in arms}, volume),
-        jobs=_job_table(shifts, stations),
-        offers=offers,
-        conflicts=conflicts,
-        observer=observer,
-        start_c=start,
-        start_housing_c=housing_c,
-        phi=phi,
-        gamma=gamma,
-        drift_k_per_s=np.array([arm.drift_k_per_s for arm in arms]),
-        believed=believed,
-        absences=no_absences() if absences is None else absences,
+    work["volume"] = np.where(work["plan"] >= 0, volume[work["plan"]], 0)
+    motors, learns = stack_motors([arm.motors for arm in arms]), all(arm.learns for arm in arms)
+    believed = [heating_of(*arm.beliefs, dt_s) if learns else np.zeros((), LAW) for arm in arms]
+    begin_c = [(arm, c, start_warm) for arm, c in zip(arms, ambient_c[0].tolist(), strict=True)]
+    first, block, curve = forecast_arrays(stack_forecasts(forecasts) if forecasts else None, LANES).values()
+    alike: dict[tuple[Work, ...], int] = {}
+    tables = Tables(
+        dt_s=float(dt_s),
+        ticks=int(ticks),
+        warning_c=float(limits.warning_c),
+        error_c=float(limits.error_c),
+        restart_c=float(limits.restart_c),
+        clear_s=float(limits.clear_s),
+        move_home_s=float(limits.move_home_s),
+        power_off=bool(limits.power_off_on_fault),
+        alpha_cu_per_k=float(motors.alpha_cu_per_k),
+        alpha_kt_per_k=float(motors.alpha_kt_per_k),
+        reference_c=float(motors.reference_c),
+        ambient_c=np.array(ambient_c, dtype=float)[None],
+        learns=learns,
+        law=np.stack([law_of(arm, dt_s) for arm in arms])[None],
+        believed=np.stack(believed)[None],
+        modal=np.stack([_modal(*each) for each in begin_c])[None],
+        start=np.stack([_at_home(arm, no_kind=work.shape[1]) for arm in arms])[None],
+        plans=np.stack([_plan(each) for each in driven] or [np.zeros((), PLAN)]),
+        excluded=bits(conflicts[volume]),
+        work=work,
+        forecast_first=first,
+        forecast_block=block.astype(np.float32),
+        forecast_curve=curve.astype(np.float32),
+        least=np.nan_to_num(np.fmin.reduce(work["difficulty"], axis=-1), nan=-1.0),
+        stations=_stations(kinds),
+        payload_kg=_of_kinds(kinds, lambda job: job.work.payload_kg),
+        value=_of_kinds(kinds, lambda job: job.value),
+        alike=_of_kinds(kinds, lambda job: alike.setdefault(job.works, len(alike))).astype(int),
     )
-    return world, plans
+    ends = np.cumsum([0, *map(len, shifts)]).tolist()
+    own = tuple(_shift_of(jobs, at, absences) for jobs, at in zip(shifts, ends, strict=False))
+    return World(tuple(arms), slots, kinds, plans, owned(tables), own)
+
+
+def stations_of(jobs: Sequence[Job]) -> tuple[str, ...]:
+    """Names of the stations of jobs."""
+    return tuple(dict.fromkeys(name for job in jobs for name in job.stations))
 
 
 def station_space(plans: Sequence[Plan]) -> tuple[Array, Array]:
@@ -234,106 +322,142 @@ def station_space(plans: Sequence[Plan]) -> tuple[Array, Array]:
     return np.array(volume, dtype=int), needs.astype(int) @ needs.T > 0
 
 
-@lru_cache(maxsize=8)
-def _laws(
-    arms: tuple[Arm, ...], dt_s: float
-) -> tuple[Motors, ThermalModel, Drive, Array, Array, HousingObserver, Law | None]:
-    """What is the same in every shift: motors, thermal models and rest of a fleet, [arm, ...], the matrices of a step,
-    the observers of the arms' housings, and what the arms believe."""
-    thermal, drives = stack_models([arm.thermal for arm in arms]), [arm.rest_drive() for arm in arms]
-    rest = Drive(np.stack([d.current_sq for d in drives]), np.stack([d.friction_w for d in drives]))
-    observers = [housing_observer(*arm.beliefs, dt_s) for arm in arms]
-    observer = HousingObserver(*(np.stack(parts) for parts in zip(*observers, strict=True)))
-    believed = None
-    if all(arm.learns for arm in arms):
-        known, motors = stack_models([arm.beliefs[0] for arm in arms]), stack_motors([arm.beliefs[1] for arm in arms])
-        believed = Law(motors, known, *known.step_matrices(dt_s))
-    return stack_motors([arm.motors for arm in arms]), thermal, rest, *thermal.step_matrices(dt_s), observer, believed
+def law_of(arm: Arm, dt_s: float) -> Array:
+    """How an arm heats up, and what it estimates of it, in steps of a length, `LAW`."""
+    observer = housing_observer(*arm.beliefs, dt_s)
+    return _filled(
+        heating_of(arm.thermal, arm.motors, dt_s),
+        housing_keep=observer.keep.T,
+        housing_gain=observer.gain.T,
+        housing_winding=observer.from_winding,
+        housing_ambient=observer.from_ambient,
+        housing_idle_w=observer.idle_w,
+        sensor_noise_k=arm.motors.sensor_noise_k,
+        drift_k_per_s=arm.drift_k_per_s,
+    )
 
 
-def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]], most: int) -> tuple[tuple[Plan, ...], Offers]:
-    shape = (len(shifts), len(arms), max(1, *map(len, shifts)), most)
-    plan, total, p_saturation = np.full(shape, -1), np.full(shape, np.nan), np.full(shape, np.nan)
-    risk, peak = np.full(shape, -1), np.full(shape, -1)
+def heating_of(thermal: ThermalModel, motors: Motors, dt_s: float) -> Array:
+    """How a network heats up in steps of a length: a `LAW` without estimates and sensors."""
+    phi, gamma = thermal.step_matrices(dt_s)
+    return _filled(
+        np.zeros((), LAW),
+        step=np.concatenate([phi - np.eye(NODES), gamma], axis=-1).T,
+        to_ambient=thermal.to_ambient,
+        copper_w_per_a2=motors.copper_w_per_a2,
+        idle_w=motors.idle_w,
+    )
+
+
+def _modal(arm: Arm, ambient_c: float, start_warm: bool) -> Array:
+    """The thermal network by its modes, and the temperatures at the start of a shift, `MODAL`."""
+    thermal = arm.thermal
+    return _filled(
+        np.zeros((), MODAL),
+        root_capacity=np.sqrt(thermal.capacity),
+        rates=thermal.rates,
+        modes=thermal.modes,
+        to_ambient=thermal.to_ambient,
+        idle_w=arm.motors.idle_w,
+        start_c=warm_start(arm, ambient_c) if start_warm else np.full(NODES, ambient_c),
+        start_housing_c=arm.believed_housings(ambient_c) if start_warm else np.full(JOINTS, ambient_c),
+    )
+
+
+def _at_home(arm: Arm, no_kind: int) -> Array:
+    """The arm at the start of a shift, `ARM`; `no_kind` is the kind of no job."""
+    rest = arm.rest_drive()
+    return _filled(
+        np.zeros((), ARM),
+        mode=IDLE,
+        plan=-1,
+        job=-1,
+        kind=no_kind,
+        current_sq=rest.current_sq,
+        friction_w=rest.friction_w,
+        phase_end_s=np.inf,
+        clear_at_s=np.inf,
+        moved_at_s=np.inf,
+    )
+
+
+def _offers(
+    arms: Sequence[Arm], kinds: Sequence[Job], most: int
+) -> tuple[tuple[Plan, ...], list[Driven], Array, list[Forecast]]:
+    """The plans of all arms for kinds of jobs, what their motion is, `WORK` [1, kind, arm, plan] but for the volumes,
+    and the forecasts to which it refers."""
+    work = np.zeros((1, max(1, len(kinds)), len(arms), most), WORK)
+    for name in ("risk", "peak", "plan"):
+        work[name] = -1
+    work["difficulty"] = work["p_saturation"] = np.nan
     rows: dict[int, int] = {}
     plans: list[Plan] = []
+    driven: list[Driven] = []
     forecasts: dict[int, tuple[int, Forecast]] = {}
+    able: dict[Work, list[int]] = {}  # few of a large cell
+    for a, arm in enumerate(arms):
+        for each in arm.plans:
+            able.setdefault(each, []).append(a)
 
     def row_of(forecast: Forecast | None) -> int:
         return -1 if forecast is None else forecasts.setdefault(id(forecast), (len(forecasts), forecast))[0]
 
-    able = _arms_of_works(tuple(arms))
-    offered: dict[tuple[int, int], list[tuple[int, ScoredPlans]]] = {}  # by id: hashing takes longest
-    for e, jobs in enumerate(shifts):
-        for j, job in enumerate(jobs):
-            alike = id(job.work), id(job.alternatives)
-            if alike not in offered:
-                those = sorted({a for work in job.works for a in able.get(work, ())})
-                offered[alike] = [(a, arms[a].offers(*job.works)) for a in those]
-            for a, offers in offered[alike]:
-                for n, (offer, score) in enumerate(offers[job.repetitions][:most]):
-                    if id(offer) not in rows:
-                        rows[id(offer)] = len(plans)
-                        plans.append(offer)
-                    plan[e, a, j, n] = rows[id(offer)]
-                    if score is not None:
-                        total[e, a, j, n] = score.total
-                        p_saturation[e, a, j, n] = np.nan if score.p_saturation is None else score.p_saturation
-                        risk[e, a, j, n], peak[e, a, j, n] = row_of(score.risk), row_of(score.peak)
-    stack = stack_forecasts([forecast for _, forecast in forecasts.values()]) if forecasts else None
-    scores = {"difficulty": total, "p_saturation": p_saturation, "risk": risk, "peak": peak, "forecasts": stack}
-    return tuple(plans), Offers(plan=plan, **scores)
+    for j, job in enumerate(kinds):
+        for a in sorted({a for each in job.works for a in able.get(each, ())}):
+            for n, (offer, score) in enumerate(arms[a].offers(*job.works)[job.repetitions][:most]):
+                if id(offer) not in rows:
+                    rows[id(offer)] = len(plans)
+                    plans.append(offer)
+                    driven.append(arms[a].driven(offer))
+                times_s, cell = driven[rows[id(offer)]][0], work[0, j, a, n]
+                cell["plan"], cell["travel_s"], cell["cycle_s"] = rows[id(offer)], times_s[0] + times_s[2], times_s[1]
+                if score is not None:
+                    cell["difficulty"], cell["risk"], cell["peak"] = score.total, row_of(score.risk), row_of(score.peak)
+                    cell["p_saturation"] = np.nan if score.p_saturation is None else score.p_saturation
+    return tuple(plans), driven, work, [forecast for _, forecast in forecasts.values()]
 
 
-@lru_cache(maxsize=8)
-def _arms_of_works(arms: tuple[Arm, ...]) -> dict[Work, list[int]]:
-    """The arms that have plans for each work: few of a large cell."""
-    able: dict[Work, list[int]] = {}
-    for a, arm in enumerate(arms):
-        for work in arm.plans:
-            able.setdefault(work, []).append(a)
-    return able
+def _plan(driven: Driven) -> Array:
+    """A row of the plan table, `PLAN`."""
+    times_s, current_sq, friction_w, _, excess = driven
+    return _filled(np.zeros((), PLAN), times_s=times_s, current_sq=current_sq, friction_w=friction_w, excess=excess)
 
 
-def _plan_table(plans: Sequence[Plan], arms: Mapping[str, Arm], volume: Array) -> PlanTable:
-    if not plans:
-        joints = len(GEN3.velocity)
-        empty = np.zeros((1, 3, joints))
-        return PlanTable(np.zeros((1, 3)), empty, empty, np.zeros((1, joints)), volume, np.zeros(1))
-    driven = zip(*(arms[plan.arm].driven(plan) for plan in plans), strict=True)
-    times_s, current_sq, friction_w, peak_tau, excess = map(np.array, driven)
-    return PlanTable(times_s, current_sq, friction_w, peak_tau, volume, excess)
+def _stations(kinds: Sequence[Job]) -> Array:
+    """Stations of each kind of job as bits, uint64 [1, kind + 1, word]; the last row, no job, has none."""
+    names = stations_of(kinds)
+    flags = np.zeros((1, max(1, len(kinds)) + 1, len(names)), bool)
+    for j, job in enumerate(kinds):
+        flags[0, j, [names.index(name) for name in job.stations]] = True
+    return bits(flags)
 
 
-def _job_table(shifts: Sequence[Sequence[Job]], stations: Sequence[str]) -> JobTable:
-    station = {name: i for i, name in enumerate(stations)}
-    after: list[list[list[int]]] = []
-    for jobs in shifts:
-        check_precedence(jobs)
-        index = {job.name: j for j, job in enumerate(jobs)}
-        after.append([[index[name] for name in job.after] for job in jobs])
-    most = max(1, *map(len, shifts))
-    alike: dict[tuple[Work, ...], int] = {}
+def _of_kinds(kinds: Sequence[Job], value: Callable[[Job], float]) -> Array:
+    """A number of each kind of job, [1, kind]; 0 if there is none."""
+    return np.array([[value(job) for job in kinds] or [0.0]], dtype=float)
 
-    def table(of: Callable[[Job], float], missing: float, dtype: type = float) -> Array:
-        rows = [[of(job) for job in jobs] + [missing] * (most - len(jobs)) for jobs in shifts]
-        return np.array(rows, dtype=dtype)
 
-    def lists(rows: Sequence[Sequence[Sequence[int]]]) -> Array:
-        longest = max((len(each) for row in rows for each in row), default=0) or 1
-        full = [[[*each, *[-1] * (longest - len(each))] for each in row] for row in rows]
-        return np.array([row + [[-1] * longest] * (most - len(row)) for row in full], dtype=int)
-
-    return JobTable(
-        names=tuple(tuple(job.name for job in jobs) for jobs in shifts),
-        exists=np.arange(most) < np.array([[len(jobs)] for jobs in shifts]),
-        release_s=table(lambda job: job.release_s, np.inf),
-        due_s=table(lambda job: job.due_s, np.inf),
-        value=table(lambda job: job.value, 0.0),
-        payload_kg=table(lambda job: job.work.payload_kg, 0.0),
-        repetitions=table(lambda job: job.repetitions, 1, int),
-        after=lists(after),
-        expires=table(lambda job: job.expires, False, bool),
-        alike=table(lambda job: alike.setdefault(job.works, len(alike)), 0, int),
-        stations=lists([[[station[name] for name in job.stations] for job in jobs] for jobs in shifts]),
+def _shift_of(jobs: Sequence[Job], first_kind: int, absences: Array | None) -> Shift:
+    """The shift of jobs, whose kinds are consecutive."""
+    check_precedence(jobs)
+    index = {job.name: j for j, job in enumerate(jobs)}
+    after = np.full((len(jobs), max((len(job.after) for job in jobs), default=0) or 1), -1)
+    for row, job in zip(after, jobs, strict=True):
+        row[: len(job.after)] = [index[name] for name in job.after]
+    return Shift(
+        kind=np.arange(first_kind, first_kind + len(jobs)),
+        release_s=np.array([job.release_s for job in jobs], dtype=float),
+        due_s=np.array([job.due_s for job in jobs], dtype=float),
+        repetitions=np.array([job.repetitions for job in jobs], dtype=int),
+        expires=np.array([job.expires for job in jobs], dtype=bool),
+        after=after,
+        absences=no_absences() if absences is None else absences,
+        names=tuple(index),
     )
+
+
+def _filled(record: Array, **fields: Array | float) -> Array:
+    """The record with some fields, whose values are padded with zeros."""
+    for name, values in fields.items():
+        record[name][tuple(slice(0, n) for n in np.shape(values))] = values
+    return record

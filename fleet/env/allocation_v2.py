@@ -5,7 +5,7 @@ always legal, 1 + slot · plans + plan claims the job in a slot by one of the ar
 returns the current job after its cycle. Of two claims for one job, station or space the lower difficulty wins, then the
 lower index.
 
-Seeds, counts and actions of callers are checked here for the batch and the adapters too.
+It is one row of a batch (`fleet.env.vector`), with a plant that moves the arms, events and a watcher.
 """
 
 from copy import copy
@@ -18,32 +18,22 @@ from pettingzoo.utils import wrappers
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
 from fleet.bus.exchange.memory import Exchange
-from fleet.engine.batch import TERMS, RewardWeights
+from fleet.engine.batch import RewardWeights, Shift
 from fleet.engine.shift import Episode as Episode
 from fleet.engine.shift import EpisodeFactory as EpisodeFactory
-from fleet.engine.shift import ShiftRunner, Watch
-from fleet.engine.state import State, World
+from fleet.engine.shift import Watch, events_of, record_of
+from fleet.engine.state import State
 from fleet.engine.step import FINISHED, OUTCOME, TICK, TOTAL
+from fleet.engine.world import World
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.render.renderer import Renderer
 from fleet.env.render.scene import CellMap
-from fleet.env.validation import Decisions, actions_of, agent_of, at_least_one, check_choice, seed_of, switch
+from fleet.env.validation import Decisions, actions_of, agent_of, at_least_one, check_choice, seed_of
+from fleet.env.vector import AHEAD_S, REWARDS, BatchEnv, Library, arm_spaces
 from fleet.events import Event
 from fleet.heat.thermal import WINDING
-from fleet.observation import Layout, Observation
+from fleet.observation import Observation
 from fleet.telemetry import MODES
-
-
-def arm_spaces(layout: Layout) -> tuple[spaces.Dict, spaces.Discrete]:
-    """Observation and action space of one arm."""
-    low, high = layout.bounds
-    observation = spaces.Dict(
-        {
-            "observation": spaces.Box(low, high, dtype=np.float32),
-            "action_mask": spaces.Box(0, 1, (layout.actions,), dtype=np.int8),
-        }
-    )
-    return observation, spaces.Discrete(layout.actions)
 
 
 def spaces_like(first: tuple[spaces.Dict, spaces.Discrete]) -> tuple[spaces.Dict, spaces.Discrete]:
@@ -55,8 +45,6 @@ def spaces_like(first: tuple[spaces.Dict, spaces.Discrete]) -> tuple[spaces.Dict
 Array = np.ndarray
 
 VERSION = "allocation_v2"
-AHEAD_S = 0.0
-"""Options are given to free arms; see `Layout.ahead_s`."""
 MaskPlace = Literal["obs", "info", "both"]
 RENDER_MODES = ("ansi", "rgb_array", "human")
 FRAMES_PER_S = 10
@@ -81,9 +69,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         near: The peers each arm has in its vector; see `fleet.observation.Layout`.
         decisions: Length of a step: one decision "interval", or until an arm may claim a job or one at work passes its
             warning limit ("events").
-        scaled: Vectors hold values of order 1 (`Field.scale`); otherwise they have the units of the fields.
-        ahead_s: Options of arms that are home later than this are 0: they cannot claim soon. inf for those of all.
-        bids: Vectors hold the bids of members; see `fleet.observation.Layout`.
+        scaled, ahead_s, bids: As in `fleet.env.vector.BatchEnv`.
     """
 
     metadata = {  # noqa: RUF012  # PettingZoo's
@@ -117,39 +103,50 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         self.render_mode = render_mode
         self.events: list[Event] = []
         self._make_episode = make_episode
-        self._weights = weights or RewardWeights()
-        self._max_cycles = None if max_cycles is None else at_least_one("max_cycles", max_cycles)
         self._keep_events = keep_events
         self._watch = watch
         self._renderer = Renderer(cell)
         self._mask_in = mask_in
         self._until_choice = decisions == "events"
         self._seeds = np.random.SeedSequence()
-        self._episode = make_episode(np.random.SeedSequence(0))
-        world = self._episode.world
-        self.possible_agents = list(world.arms)
+        self._draw(np.random.SeedSequence(0))
+        arms, ticks = self.world.arms, self.world.ticks
+        self._last_tick = ticks if max_cycles is None else min(ticks, at_least_one("max_cycles", max_cycles))
+        self.possible_agents = list(arms)
         self.agents: list[str] = []
-        self._exchange = exchange or Exchange(world.arms)
-        self.layout = Layout(
-            len(world.arms),
-            world.slots,
-            near,
-            world.plans_per_job,
-            scaled=scaled,
-            delivered=not self._exchange.perfect,
-            ahead_s=ahead_s,
-            bids=switch("bids", bids),
-        )
+        self._exchange = exchange or Exchange(arms)
+        self._near = near
+        self._options: dict[str, Any] = {
+            "weights": weights,
+            "exchanges": None if self._exchange.perfect else [self._exchange],
+            "scaled": scaled,
+            "ahead_s": ahead_s,
+            "bids": bids,
+            "keep_events": keep_events,
+            "trace": watch is not None or (keep_events and not self._episode.plant.follows_plans),
+        }
+        self.batch = self._one_row()
+        """The batch of one env, with the true state (not for policies); another one if a reset brings another fleet."""
+        self.layout = self.batch.layout
         first = arm_spaces(self.layout)
         self.observation_spaces: dict[str, spaces.Space[Any]] = {}
         self.action_spaces: dict[str, spaces.Space[Any]] = {}
-        for arm in world.arms:
+        for arm in arms:
             observation, self.action_spaces[arm] = spaces_like(first)
             self.observation_spaces[arm] = observation["observation"] if mask_in == "info" else observation
         low, high = self.layout.bounds
-        self.state_space = spaces.Box(np.tile(low, len(world.arms)), np.tile(high, len(world.arms)), dtype=np.float32)
-        self._shift: ShiftRunner | None = None
-        self._tick = 0
+        self.state_space = spaces.Box(np.tile(low, len(arms)), np.tile(high, len(arms)), dtype=np.float32)
+        self._started, self._tick = False, 0
+        self._delivered_before = 0
+
+    def _draw(self, seed: np.random.SeedSequence) -> Shift:
+        self._episode = self._make_episode(seed)
+        return self._episode.shift
+
+    def _one_row(self) -> BatchEnv:
+        world = self.world
+        library = Library(world.arms, world.slots, world.tables, self._draw, self._near, self._episode.twins)
+        return BatchEnv(library, 1, autoreset=False, **self._options)
 
     @property
     def world(self) -> World:
@@ -164,7 +161,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
     @property
     def truth(self) -> State:
         """A copy of the true state (not for policies)."""
-        return self._begun("looking at its state").state.copy()
+        return self._begun("looking at its state").engine.state.copy(jobs=slice(self.world.jobs))
 
     @property
     def tick(self) -> int:
@@ -175,7 +172,10 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
     @property
     def messages(self) -> int:
         """Number of messages delivered to peers in this episode."""
-        return self._begun("counting messages").messages
+        self._begun("counting messages")
+        if not self._exchange.perfect:
+            return self._exchange.delivered - self._delivered_before
+        return self.layout.arms * (self.layout.arms - 1) * (self.tick + 1)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """Space of an agent's observation; the same object on every call."""
@@ -197,18 +197,13 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             self._seeds, entropy = seed_of(seed), seed_of(seed)
         else:
             entropy = self._seeds.spawn(1)[0]
-        self._episode = self._make_episode(entropy)
-        self.agents = list(self.possible_agents)
-        self.events = []
-        self._shift = ShiftRunner(
-            self._episode,
-            self._weights,
-            exchange=self._exchange,
-            keep_events=self._keep_events,
-            watch=self._watch,
-            layout=self.layout,
-        )
-        self.events, self._tick = self._shift.events, 0
+        shift = self._draw(entropy)
+        if self.world.tables is not self.batch.engine.tables:  # another fleet
+            self.batch = self._one_row()
+        self._delivered_before = self._exchange.delivered
+        self.batch.begin(_FIRST, [shift], [self._episode.sensors])
+        self.agents, self.events = list(self.possible_agents), []
+        self._started, self._tick = True, 0
         observations, masks = self._observations()
         return observations, self._infos(np.zeros(OUTCOME), masks, 0.0)
 
@@ -224,7 +219,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         before = self._tick
         outcome, finished, over = self.advance(actions)
         observations, masks = self._observations()
-        infos = self._infos(outcome, masks, (self._tick - before) * self.world.dt_s)
+        infos = self._infos(outcome, masks, (self._tick - before) * self.batch.engine.tables.dt_s)
         reward, arms = float(outcome[TOTAL]), self.possible_agents
         return (
             observations,
@@ -240,22 +235,33 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         Returns the outcome, as `fleet.engine.batch.Engine.step`, and whether all jobs are done and whether the time is
         over.
         """
-        shift = self._begun("step()")
+        batch = self._begun("step()")
         if not self.agents:
             raise RuntimeError("The episode is over: call reset() before step().")
         chosen = actions_of(self.possible_agents, actions)
-        last_tick = min(self.world.ticks, self._max_cycles or self.world.ticks)
-        outcome = shift.step(chosen)
-        while self._until_choice and not outcome[FINISHED] and outcome[TICK] < last_tick and not shift.choice:
-            more = shift.step(None)
+        outcome, last_tick = self._advance(batch, chosen[None]), self._last_tick
+        while self._until_choice and not outcome[FINISHED] and outcome[TICK] < last_tick and not batch.engine.choice[0]:
+            more = self._advance(batch, None)
             more[: TOTAL + 1] += outcome[: TOTAL + 1]
             outcome = more
-        self._tick = int(outcome[TICK])
-        finished = bool(outcome[FINISHED])
+        self._tick, finished = int(outcome[TICK]), bool(outcome[FINISHED])
         over = not finished and self._tick >= last_tick
         if finished or over:
             self.agents = []
         return outcome, finished, over
+
+    def _advance(self, batch: BatchEnv, actions: Array | None) -> Array:
+        """One decision interval; return its outcome."""
+        episode, engine = self._episode, batch.engine
+        outcome = engine.step(actions, batch.parts, drive=episode.drive)[0]
+        batch.deliver(_FIRST)
+        if self._keep_events:
+            self.events += events_of(episode.world, engine.state, engine.events)
+            if not episode.plant.follows_plans:
+                self.events += episode.plant.contacts(episode.world, record_of(engine))
+        if self._watch is not None:
+            self._watch(record_of(engine))
+        return outcome
 
     def state(self) -> Array:
         """Vectors of all arms, concatenated, float32."""
@@ -264,27 +270,27 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
     @property
     def may_claim(self) -> bool:
         """Whether an arm may claim a job now."""
-        return bool(self._begun("may_claim").mask[:, 1:-1].any())
+        return bool(self._begun("may_claim").engine.mask[0, :, 1:-1].any())
 
     def knowledge(self) -> dict[str, Observation]:
         """Current observation of every arm by name, as policies read it."""
-        shift = self._begun("knowledge()")
-        shared, own = shift.parts
-        return self.layout.read_each(self.possible_agents, shared.copy(), own.copy(), shift.mask.copy())
+        batch = self._begun("knowledge()")
+        shared, own = batch.parts
+        return self.layout.read_each(self.possible_agents, shared[0].copy(), own[0].copy(), batch.engine.mask[0].copy())
 
     def lookahead(self, simulator: CellSimulator) -> Lookahead:
         """A simulator of the cell in the current episode, for policies that plan."""
-        return Lookahead(simulator, self._begun("looking ahead").engine)
+        return self._begun("looking ahead").lookahead(simulator, 0)
 
     def render(self) -> Array | str | None:
         """The fleet as a picture, uint8 [height, width, 3], in mode "rgb_array", as a table of text in mode "ansi", or
         shown in a window in mode "human" (which returns nothing, as does no mode)."""
         if self.render_mode is None:
             return None
-        shift, world = self._begun("render()"), self.world
+        self._begun("render()")
         if self.render_mode == "ansi":
-            return _table(world, shift.state)
-        frame = self._renderer.frame(world, shift.state)
+            return _table(self.world, self.truth)
+        frame = self._renderer.frame(self.world, self.truth)
         if self.render_mode == "rgb_array":
             return frame
         self._renderer.show(frame)
@@ -295,15 +301,14 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         self._exchange.close()
         self._renderer.close()
 
-    def _begun(self, what: str) -> ShiftRunner:
-        if self._shift is None:
+    def _begun(self, what: str) -> BatchEnv:
+        if not self._started:
             raise RuntimeError(f"No episode has started: call reset() before {what}.")
-        return self._shift
+        return self.batch
 
     def _observations(self) -> tuple[dict[str, Any], Array]:
         """Observations by agent, and the masks [arm, option + 2]; all in arrays of their own."""
-        shift = self._begun("observing")
-        vectors, masks = self.layout.join(*shift.parts), shift.mask.copy()
+        vectors, masks = self.layout.join(*self.batch.parts)[0], self.batch.engine.mask[0].copy()
         arms = self.possible_agents
         if self._mask_in == "info":
             return {arm: vectors[a] for a, arm in enumerate(arms)}, masks
@@ -311,11 +316,11 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
 
     def _infos(self, outcome: Array, masks: Array, elapsed_s: float) -> dict[str, dict[str, Any]]:
         *rewards, _, _, jobs_done, _ = outcome.tolist()
-        of_all = {"jobs_done": jobs_done, "elapsed_s": elapsed_s, **dict(zip(_REWARDS, rewards, strict=True))}
+        of_all = {"jobs_done": jobs_done, "elapsed_s": elapsed_s, **dict(zip(REWARDS, rewards, strict=True))}
         infos: dict[str, dict[str, Any]] = {
             arm: {"faults": faults, "illegal": illegal, "peak_c": peak_c, "above_warning_s": above_s, **of_all}
             for arm, (faults, illegal, peak_c, above_s) in zip(
-                self.possible_agents, self._begun("infos").infos, strict=True
+                self.possible_agents, self.batch.engine.infos[0].tolist(), strict=True
             )
         }
         if self._mask_in != "obs":
@@ -324,14 +329,14 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         return infos
 
 
-_REWARDS = tuple(f"reward_{name}" for name in TERMS)
+_FIRST = np.zeros(1, dtype=int)
 
 
 def _table(world: World, state: State) -> str:
     rows = [f"t = {state.tick[0] * world.dt_s:7.0f} s"]
     for a, arm in enumerate(world.arms):
         job = state.job[0, a]
-        name = world.jobs.names[0][job] if job >= 0 else "-"
+        name = world.shifts[0].names[job] if job >= 0 else "-"
         temps = " ".join(f"{t:5.1f}" for t in state.temp_c[0, a, WINDING])
         rows.append(f"{arm:>10}  {MODES[state.mode[0, a]]:<8} {name:<20} {temps}")
     return "\n".join(rows)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet.engine.batch import Engine, RewardWeights, shifts_of
+from fleet.engine.batch import Engine, RewardWeights
 from fleet.engine.state import BROKEN, DONE, GIVEN_UP, RUNNING, State
 from fleet.engine.tables import Plans, Script, Tables
 from fleet.heat.thermal import HOUSING, WINDING
@@ -96,7 +96,6 @@ class CellSimulator:
             self._correct(engine, env, known)
         mine.tables.work["difficulty"] = engine.tables.work["difficulty"]  # it decides between claims
         mine.tables.ambient_c[:] = self._tables.ambient_c[:, [min(tick, mine.tables.ticks - 1)]]
-        mine.reset(np.arange(SIDE_BY_SIDE), shifts_of(known, [0]) * SIDE_BY_SIDE)
         mine.load(known)
         self._state = mine.state.copy(slice(0, 1))
         fleet, kind = int(state.fleet[env]), known.kind[0]

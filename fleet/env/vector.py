@@ -1,7 +1,6 @@
 """Many shifts at once: the batched environment for trainers.
 
-It has the engine of `fleet.env.allocation_v2` with a leading env axis: a row equals that env bit for bit, for any
-number of rows.
+`fleet.env.allocation_v2` is one row of it: a row does not depend on the number of rows.
 
 Large arrays are reused when nobody holds them any more: clearing the pages of a new array costs more than filling it.
 """
@@ -14,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, get_args
 
 import numpy as np
+from gymnasium import spaces
 
 from fleet.bus.exchange.memory import Exchange
 from fleet.engine.batch import TERMS, Engine, Parts, RewardWeights, Shift, empty_parts
@@ -21,7 +21,6 @@ from fleet.engine.shift import deliver
 from fleet.engine.state import State
 from fleet.engine.step import FINISHED, JOBS_DONE, OUTCOME, TICK, TOTAL
 from fleet.engine.tables import INFO, Tables
-from fleet.env.allocation_v2 import AHEAD_S, arm_spaces
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.validation import Decisions, at_least_one, check_choice, seeds_of, switch
 from fleet.observation import Layout, Observation
@@ -86,6 +85,24 @@ def keep_pages() -> bool:
     return mallopt is not None and all(mallopt(which, _MOST) == 1 for which in (_MMAP_THRESHOLD, _TRIM_THRESHOLD))
 
 
+REWARDS = tuple(f"reward_{name}" for name in TERMS)
+"""Names of the reward terms in infos."""
+AHEAD_S = 0.0
+"""Options are given to free arms; see `Layout.ahead_s`."""
+
+
+def arm_spaces(layout: Layout) -> tuple[spaces.Dict, spaces.Discrete]:
+    """Observation and action space of one arm."""
+    low, high = layout.bounds
+    observation = spaces.Dict(
+        {
+            "observation": spaces.Box(low, high, dtype=np.float32),
+            "action_mask": spaces.Box(0, 1, (layout.actions,), dtype=np.int8),
+        }
+    )
+    return observation, spaces.Discrete(layout.actions)
+
+
 Obs = dict[str, Array]
 """What arms know, in both parts of `fleet.observation.Layout`, and their legal actions: {"shared": float32 [env,
 shared], "own": float32 [env, arm, own], "action_mask": int8 [env, arm, option + 2]}; `Layout.join` makes vectors."""
@@ -101,6 +118,8 @@ class Library:
     draw: Callable[[np.random.SeedSequence], Shift]
     near: tuple[tuple[int, ...], ...] | None = None
     """The peers each arm has in its vector; see `fleet.observation.Layout`."""
+    twins: tuple[str, ...] | None = None
+    """Version of each arm's difficulty model, for messages."""
 
 
 class BatchEnv:
@@ -122,9 +141,16 @@ class BatchEnv:
         exchanges: What carries the messages of the arms of each env; perfect and immediate if not given.
         decisions: Length of a step: one decision "interval", or until an arm may claim a job ("events"), which takes no
             exchanges.
-        scaled, ahead_s, bids: As in `fleet.env.allocation_v2.AllocationEnv`.
+        scaled: Vectors hold values of order 1 (`Field.scale`); otherwise they have the units of the fields.
+        ahead_s: Options of arms that are home later than this are 0: they cannot claim soon. inf for those of all.
+        bids: Vectors hold the bids of members; see `fleet.observation.Layout`.
         keep_path: Keep the temperatures of the whole shift in `path_c`.
         shares_heat: Without exchanges: whether the arms tell each other what heat they measure, as on a perfect bus.
+        keep_events, trace: As `events` and `trace` of `fleet.engine.batch.Engine`.
+
+    Attributes:
+        engine: Steps the shifts.
+        parts: Both parts of the current observations.
     """
 
     def __init__(
@@ -145,6 +171,8 @@ class BatchEnv:
         bids: bool = False,
         keep_path: bool = False,
         shares_heat: bool = True,
+        keep_events: bool = False,
+        trace: bool = False,
     ) -> None:
         self.num_envs = num_envs = at_least_one("num_envs", num_envs)
         self.agents = library.arms
@@ -172,15 +200,19 @@ class BatchEnv:
         self.autoreset = autoreset
         self._shelves = [Shelf(each.shape, np.float32) for each in empty_parts(self.layout, num_envs)]
         self._library = library
-        self._engine = Engine(
+        self.engine = Engine(
             library.tables,
             num_envs,
             self.layout,
             weights or RewardWeights(),
+            events=keep_events,
+            trace=trace,
             path=keep_path,
             shares_heat=shares_heat,
             threads=at_least_one("threads", threads),
         )
+        self.parts = self._no_parts()
+        self._all = np.arange(num_envs)
         self._seeds = seeds_of(seed, num_envs)
         self._fresh = np.ones(num_envs, dtype=bool)
         """Rows whose next shift is that of their seed itself."""
@@ -189,12 +221,14 @@ class BatchEnv:
         if exchanges is not None and len(exchanges) != num_envs:
             raise ValueError(f"exchanges must be one per env ({num_envs}, got {len(exchanges)}).")
         check_choice("decisions", decisions, get_args(Decisions))
-        self._events = decisions == "events"
-        if self._events and exchanges is not None:
+        self._until_choice = decisions == "events"
+        if self._until_choice and exchanges is not None:
             raise ValueError("decisions='events' takes no exchanges: messages are exchanged once per interval.")
         self._elapsed_s = np.zeros(num_envs)
         """Length of the last step of each env."""
         self._exchanges = exchanges
+        self._names: list[tuple[str, ...]] = [()] * num_envs
+        """Of the jobs of each env."""
         self._delivered = None if exchanges is None else self._no_parts()
         """Knowledge of the arms with their received messages; only with exchanges."""
 
@@ -202,19 +236,19 @@ class BatchEnv:
     def state(self) -> State:
         """Copy of the true state of all envs (not for policies)."""
         self._check_begun("looking at its state")
-        return self._engine.state.copy()
+        return self.engine.state.copy()
 
     @property
     def path_c(self) -> Array:
         """True temperatures at the end of each interval of the current shifts, °C, [env, tick, arm, node] (not for
         policies); only with `keep_path`."""
-        return self._engine.path_c
+        return self.engine.path_c
 
     @property
     def temp_c(self) -> Array:
         """True temperatures, °C, [env, arm, node], a view that the next step overwrites (not for policies)."""
         self._check_begun("looking at its temperatures")
-        return self._engine.state.temp_c
+        return self.engine.state.temp_c
 
     def reset(
         self, seed: int | Sequence[int] | None = None, *, rows: Array | Sequence[int] | None = None
@@ -238,13 +272,12 @@ class BatchEnv:
         chosen = self._rows_of(rows)
         if not self._begun and len(chosen) < self.num_envs:
             raise RuntimeError("No episode has started: call reset() for all envs before reset(rows=…).")
-        self._parts = self._no_parts()
+        self.parts = self._no_parts()
         self._begin(chosen)
         if len(chosen) < self.num_envs:
-            self._observe(np.setdiff1d(np.arange(self.num_envs), chosen), self._parts)
-        self._begun = True
+            self._observe(np.setdiff1d(self._all, chosen), self.parts)
         nothing, self._elapsed_s = np.zeros((self.num_envs, OUTCOME)), np.zeros(self.num_envs)
-        nothing[:, JOBS_DONE] = self._engine.state.done
+        nothing[:, JOBS_DONE] = self.engine.state.done
         return self._obs(), self._info(nothing, np.zeros(0, dtype=int), None)
 
     def step(self, actions: object) -> tuple[Obs, Array, Array, Array, dict[str, Any]]:
@@ -270,16 +303,14 @@ class BatchEnv:
             raise RuntimeError(
                 f"The shift of {len(which)} env(s) is over (first: env {which[0]}): call reset(rows=…) before step()."
             )
-        chosen = self._checked(actions)
-        parts = self._no_parts()
-        until = self._last_tick if self._events else None
-        outcome = self._engine.step(chosen, parts, until)
+        chosen, parts = self._checked(actions), self._no_parts()
+        outcome = self.engine.step(chosen, parts, self._last_tick if self._until_choice else None)
         tick, finished = outcome[:, TICK], outcome[:, FINISHED] > 0
-        self._elapsed_s = (tick - self._tick) * self._engine.tables.dt_s
-        self._tick = tick
-        self._deliver(np.arange(self.num_envs), parts)
+        self._elapsed_s = (tick - self._tick) * self.engine.tables.dt_s
+        self._tick, self.parts = tick, parts
+        self.deliver(self._all)
         truncated = ~finished & (tick >= self._last_tick)
-        self._parts, self._over = parts, finished | truncated
+        self._over = finished | truncated
         ended = np.flatnonzero(self._over)
         self._last_tick[ended] = self._whole
         last = self._obs(ended) if len(ended) and self.autoreset else None
@@ -296,12 +327,12 @@ class BatchEnv:
         """Current observations by field, leading axes [env, arm], as policies read them."""
         self._check_begun("knowledge()")
         parts = self._no_parts()  # the caller may have written into the last ones
-        self._observe(np.arange(self.num_envs), parts)
-        return self.layout.read_parts(*parts, self._engine.mask.copy())
+        self._observe(self._all, parts)
+        return self.layout.read_parts(*parts, self.engine.mask.copy())
 
     def lookahead(self, simulator: CellSimulator, env: int) -> Lookahead:
         """A simulator of the cell for the shifts of an env, for policies that plan."""
-        return Lookahead(simulator, self._engine, env)
+        return Lookahead(simulator, self.engine, env)
 
     def close(self) -> None:
         """Do nothing: a batch holds no resources."""
@@ -310,40 +341,50 @@ class BatchEnv:
         if not len(rows):
             return
         seeds = [self._seeds[e] if self._fresh[e] else self._seeds[e].spawn(1)[0] for e in rows.tolist()]
-        self._engine.reset(rows, [self._library.draw(seed) for seed in seeds])
-        self._fresh[rows], self._over[rows], self._tick[rows] = False, False, 0
-        self._engine.observe(rows, self._parts)
-        for e, seed in zip(rows.tolist(), seeds, strict=True):
-            if self._exchanges is not None:
-                self._exchanges[e].begin(np.random.default_rng(exchange_seed(shift_seeds(seed)[1])))
-        self._deliver(rows, self._parts)
+        self._fresh[rows] = False
+        self.begin(rows, [self._library.draw(seed) for seed in seeds], [shift_seeds(seed)[1] for seed in seeds])
+
+    def begin(self, rows: Array, shifts: Sequence[Shift], sensors: Sequence[np.random.SeedSequence]) -> None:
+        """Begin given shifts in some envs, with their observations in `parts`.
+
+        Args:
+            sensors: Seed of the sensors of each shift, from which delays and losses of messages follow.
+        """
+        self.engine.reset(rows, shifts)
+        self._begun, self._over[rows], self._tick[rows] = True, False, 0
+        self.engine.observe(rows, self.parts)
+        if self._exchanges is not None:
+            for e, shift, seed in zip(rows.tolist(), shifts, sensors, strict=True):
+                self._exchanges[e].begin(np.random.default_rng(exchange_seed(seed)))
+                self._names[e] = shift.names or tuple(map(str, range(len(shift.kind))))
+        self.deliver(rows)
 
     def _observe(self, rows: Array, parts: Parts) -> None:
         """Write the current observations of some envs into `parts` again."""
         if self._delivered is None:
-            self._engine.observe(rows, parts)
+            self.engine.observe(rows, parts)
         else:
             for part, delivered in zip(parts, self._delivered, strict=True):
                 part[rows] = delivered[rows]
 
-    def _deliver(self, rows: Array, parts: Parts) -> None:
-        """Replace what the arms observe of each other by the delivered messages."""
+    def deliver(self, rows: Array) -> None:
+        """Replace what the arms of some envs observe of each other, in `parts`, by the delivered messages."""
         if self._exchanges is None or self._delivered is None:
             return
-        names = [str(j) for j in range(self._engine.state.jobs.shape[1])]
+        twins = self._library.twins or ("",) * len(self.agents)
         for e in rows.tolist():
-            deliver(self._exchanges[e], self._engine, parts, names, ("",) * len(self.agents), e)
-        for part, delivered in zip(parts, self._delivered, strict=True):
+            deliver(self._exchanges[e], self.engine, self.parts, self._names[e], twins, e)
+        for part, delivered in zip(self.parts, self._delivered, strict=True):
             delivered[rows] = part[rows]
 
     def _obs(self, rows: Array | None = None) -> Obs:
-        shared, own = self._parts
+        shared, own = self.parts
         if rows is None:
-            return {"shared": shared, "own": own, "action_mask": self._engine.mask.copy()}
-        return {"shared": shared[rows], "own": own[rows], "action_mask": self._engine.mask[rows]}
+            return {"shared": shared, "own": own, "action_mask": self.engine.mask.copy()}
+        return {"shared": shared[rows], "own": own[rows], "action_mask": self.engine.mask[rows]}
 
     def _info(self, outcome: Array, ended: Array, last: Obs | None) -> dict[str, Any]:
-        infos = self._engine.infos.copy()
+        infos = self.engine.infos.copy()
         if last is None:
             shared, own = empty_parts(self.layout, 0)
             mask = np.zeros((0, self.layout.arms, self.layout.actions), np.int8)
@@ -352,7 +393,7 @@ class BatchEnv:
             **{name: infos[name] for name in INFO.names or ()},
             "jobs_done": outcome[:, JOBS_DONE],
             "elapsed_s": self._elapsed_s,
-            **{f"reward_{name}": outcome[:, n] for n, name in enumerate(TERMS)},
+            **{name: outcome[:, n] for n, name in enumerate(REWARDS)},
             "final_envs": ended,
             "final_obs": last,
         }
@@ -378,7 +419,7 @@ class BatchEnv:
 
     def _rows_of(self, rows: Array | Sequence[int] | None) -> Array:
         if rows is None:
-            return np.arange(self.num_envs)
+            return self._all
         chosen = np.asarray(rows)
         if chosen.dtype == bool and chosen.shape == (self.num_envs,):
             return np.flatnonzero(chosen)

@@ -10,10 +10,9 @@ import numpy as np
 
 from agents.policy import WAIT, PlanningPolicy, Policy, only_choices
 from agents.schedules import LEAST_GAIN, Changes, Schedules, stack
-from fleet.engine.batch import Engine, RewardWeights, empty_parts, shifts_of
-from fleet.engine.state import World
+from fleet.engine.batch import Engine, RewardWeights, empty_parts
 from fleet.engine.step import FINISHED, TOTAL
-from fleet.engine.tables import tables_of
+from fleet.engine.world import World
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.validation import actions_of
 from fleet.observation import Layout, Observation
@@ -72,28 +71,25 @@ class ShiftSimulator:
         bids: bool = False,
         compiled: bool | None = None,
     ) -> None:
-        tables, drawn = tables_of(world)
         self.world, self.rows, self._simulator = world, rows, simulator
-        self.jobs = int(world.jobs.exists[0].sum())
+        self._shift = replace(world.shifts[0], noise_key=noise_key)
+        self.jobs = len(self._shift.kind)
         self.evaluations = 0
         """Shifts simulated so far."""
         self._layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job, bids=bids)
-        self._shifts = shifts_of(drawn, [noise_key])[:1] * rows
-        self._engine = Engine(tables, rows, self._layout, weights, jobs=world.jobs.exists.shape[1], compiled=compiled)
+        self._engine = Engine(world.tables, rows, self._layout, weights, jobs=self.jobs, compiled=compiled)
         self._parts = empty_parts(self._layout, rows)
 
     def changes(self, rng: np.random.Generator) -> Changes:
-        tables, jobs = self._engine.tables, self.jobs
-        can = tables.work["plan"][0, :jobs].swapaxes(0, 1) >= 0
-        return Changes(
-            can, tables.stations[0, :jobs], self.world.jobs.release_s[0, :jobs], self.world.horizon_s,
-            self.world.dt_s, rng,
-        )  # fmt: skip
+        tables, shift = self.world.tables, self._shift
+        can = tables.work["plan"][0, shift.kind].swapaxes(0, 1) >= 0
+        stations = tables.stations[0, shift.kind]
+        return Changes(can, stations, shift.release_s, self.world.horizon_s, self.world.dt_s, rng)
 
     def run(self, schedules: Schedules) -> Simulated:
         """The results of at most `rows` schedules."""
         given = len(schedules.arm)
-        self._engine.reset(np.arange(given), self._shifts[:given])
+        self._engine.reset(np.arange(given), [self._shift] * given)
         played = self._engine.play(schedules, np.ones(self.world.ticks))
         self.evaluations += given
         lists = [
@@ -109,7 +105,7 @@ class ShiftSimulator:
         """
         engine, world, given = self._engine, self.world, len(policies)
         skips = all(only_choices(policy) for policy in policies)
-        engine.reset(np.arange(self.rows), self._shifts)
+        engine.reset(np.arange(self.rows), [self._shift] * self.rows)
         engine.observe(np.arange(self.rows), self._parts)
         for e, policy in enumerate(policies):
             if isinstance(policy, PlanningPolicy) and self._simulator:
@@ -153,9 +149,10 @@ class ShiftSimulator:
 
 def without_scores(world: World) -> World:
     """Remove the predictions from a world, which only policies read; awards do not change."""
-    unknown = np.full_like(world.offers.risk, -1)
-    offers = replace(world.offers, risk=unknown, peak=unknown, forecasts=None)
-    return replace(world, offers=offers)
+    tables = world.tables
+    work, curve = tables.work.copy(), tables.forecast_curve[:0]
+    work["risk"] = work["peak"] = -1
+    return replace(world, tables=tables._replace(work=work, forecast_curve=curve))
 
 
 @dataclass
@@ -224,7 +221,8 @@ def hindsight(
         return Hindsight(best, best_claims, 0, 0.0)
     chosen = np.argsort(-starts.reward)[: simulator.rows // 4]
     present = changes.of_awards(starts.start_s[chosen], starts.arm[chosen], starts.option[chosen])
-    value = float(simulator.world.jobs.value[0][simulator.world.jobs.exists[0]].sum())
+    world = simulator.world
+    value = float(world.tables.value[0, world.shifts[0].kind].sum())
     tried = stack([present, changes.freed(present)])
     result = simulator.run(tried)
     began_s = time.process_time()  # that run may have compiled the simulator, for a minute

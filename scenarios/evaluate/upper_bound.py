@@ -58,8 +58,9 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.optimize import Bounds, LinearConstraint, linprog, milp
 from scipy.sparse import csr_array, vstack
 
-from fleet.engine.batch import RewardWeights
-from fleet.engine.state import World
+from fleet.engine.batch import RewardWeights, Shift
+from fleet.engine.tables import drive_of
+from fleet.engine.world import World
 from fleet.heat.motor import magnet_factor
 from fleet.heat.thermal import HOUSING, WINDING, advance, node_heat
 from fleet.robot import JOINTS
@@ -143,21 +144,45 @@ class Relaxation:
         return np.append(np.arange(0.0, self.world.horizon_s - ROUNDING_S, length_s), self.world.horizon_s)
 
     @property
+    def shift(self) -> Shift:
+        return self.world.shifts[0]
+
+    @cached_property
+    def offered(self) -> Array:
+        """Rows of the plan table that each arm has for each job, int [arm, job, plan]; −1 for none."""
+        return self.world.tables.work["plan"][0, self.shift.kind].swapaxes(0, 1)
+
+    @cached_property
+    def times_s(self) -> Array:
+        """Durations of the phases of each plan, [plan, phase]."""
+        return self.world.tables.plans["times_s"]
+
+    @cached_property
+    def start_c(self) -> Array:
+        """Temperatures at the start of the shift, [arm, node]."""
+        return self.world.tables.modal["start_c"][0] + self.shift.ambient_offset_k
+
+    @cached_property
+    def ambient_c(self) -> Array:
+        """Ambient temperature at each arm during each tick, [tick, arm]."""
+        return self.world.tables.ambient_c[0] + self.shift.ambient_offset_k
+
+    @property
     def periods(self) -> int:
         return len(self.edges_s) - 1
 
     @cached_property
     def tail_s(self) -> float:
         """Longest retreat and one interval: what a visit may last beyond its last cycle."""
-        return float(self.world.plans.times_s[:, 2].max()) + self.world.dt_s
+        return float(self.times_s[:, 2].max()) + self.world.dt_s
 
     @cached_property
     def base_w(self) -> Array:
         """Smallest heat of a powered arm, resting or at work, W, [arm, node]."""
         world = self.world
-        base = self._heat_w(np.arange(len(world.arms)), world.rest.current_sq, world.rest.friction_w)
+        base = self._heat_w(np.arange(len(world.arms)), *drive_of(world.tables.start[0]))
         for arm in range(len(world.arms)):
-            rows = np.unique(world.offers.plan[0, arm])
+            rows = np.unique(self.offered[arm])
             for phase in range(3):
                 plans = rows[rows >= 0]
                 of_plans = self.plan_heat_w(np.full(len(plans), arm), plans, phase)
@@ -166,12 +191,12 @@ class Relaxation:
 
     def plan_heat_w(self, arm: Array, plan: Array, phase: int = 1) -> Array:
         """Smallest heat in a phase of plans (the cycle) of arms, W, [n, node], at the lowest temperatures."""
-        plans = self.world.plans
-        return self._heat_w(arm, plans.current_sq[plan, phase], plans.friction_w[plan, phase])
+        current_sq, friction_w = drive_of(self.world.tables.plans[plan])
+        return self._heat_w(arm, current_sq[:, phase], friction_w[:, phase])
 
     def _heat_w(self, arm: Array, current_sq: Array, friction_w: Array) -> Array:
         motors = self.world.motors
-        coldest_c = min(float(self.world.start_c.min()), float(self.world.ambient_c.min()))
+        coldest_c = min(float(self.start_c.min()), float(self.ambient_c.min()))
         # The coldest magnets are the strongest: their torque constant falls with the temperature.
         assert motors.alpha_kt_per_k <= 0 <= motors.alpha_cu_per_k
         resistance = motors.copper_w_per_a2[arm] * (1.0 + motors.alpha_cu_per_k * (coldest_c - motors.reference_c))
@@ -181,15 +206,14 @@ class Relaxation:
     @cached_property
     def release_s(self) -> Array:
         """When an arm can begin each job at the earliest, [job]; inf for one that cannot be done within the shift."""
-        world, jobs = self.world, self.world.jobs
-        begin_s = np.ceil(jobs.release_s[0, : self.jobs] / world.dt_s - ROUNDING_S) * world.dt_s
-        plan = world.offers.plan[0, :, : self.jobs]
-        times_s = world.plans.times_s[plan]
-        whole_s = times_s[..., 0] + jobs.repetitions[0, : self.jobs, None] * times_s[..., 1]
+        world, shift, plan = self.world, self.shift, self.offered
+        begin_s = np.ceil(shift.release_s / world.dt_s - ROUNDING_S) * world.dt_s
+        times_s = self.times_s[plan]
+        whole_s = times_s[..., 0] + shift.repetitions[:, None] * times_s[..., 1]
         shortest_s = np.where(plan >= 0, whole_s, np.inf).min(axis=(0, 2))
         for _ in range(self.jobs):
             done_s = np.append(begin_s + shortest_s, -np.inf)  # the last one for "no job before"
-            later_s = np.maximum(begin_s, done_s[jobs.after[0, : self.jobs]].max(axis=1))
+            later_s = np.maximum(begin_s, done_s[shift.after].max(axis=1))
             if np.array_equal(later_s, begin_s):
                 break
             begin_s = later_s
@@ -197,7 +221,7 @@ class Relaxation:
 
     @property
     def jobs(self) -> int:
-        return int(self.world.jobs.exists[0].sum())
+        return len(self.shift.kind)
 
     @cached_property
     def pieces(self) -> Pieces:
@@ -209,15 +233,15 @@ class Relaxation:
         return Pieces(*(column.astype(int) for column in (arm, job, plan, period)), *rest)
 
     def _pieces_of(self, job: int) -> list[Array]:
-        world, edges_s, dt_s = self.world, self.edges_s, self.world.dt_s
-        offered = world.offers.plan[0, :, job]
-        rows, begin_s, times_s = offered[offered >= 0], self.release_s[job], world.plans.times_s
+        shift, edges_s, dt_s = self.shift, self.edges_s, self.world.dt_s
+        offered = self.offered[:, job]
+        rows, begin_s, times_s = offered[offered >= 0], self.release_s[job], self.times_s
         if not len(rows) or begin_s >= edges_s[-1]:
             return []
-        count = int(world.jobs.repetitions[0, job])
+        count = int(shift.repetitions[job])
         cycles = np.arange(1, count + 1)
         tail_s = times_s[rows, 2].max() + dt_s
-        due_s, value = world.jobs.due_s[0, job], world.jobs.value[0, job]
+        due_s, value = shift.due_s[job], self.world.kinds[shift.kind[job]].value
         step_s = count * max(float(times_s[rows, 1].min()), ROUNDING_S)
         start_s = np.maximum(edges_s[:-1], begin_s)
         steps = np.where(start_s >= due_s + tail_s, np.floor((start_s - due_s - tail_s) / step_s) + 1.0, 0.0)
@@ -225,7 +249,7 @@ class Relaxation:
         # A job of a positive worth has no share in a period that is more than a step below zero.
         least = value * self.weights.tardiness / 60.0 * step_s
         possible = (edges_s[1:] > begin_s) & (worth >= least - 1e-9)
-        if world.jobs.expires[0, job]:
+        if shift.expires[job]:
             longest_s = (times_s[rows, 0] + count * times_s[rows, 1]).max() + tail_s
             possible &= edges_s[:-1] <= due_s + longest_s
         period = np.flatnonzero(possible)
@@ -274,10 +298,9 @@ class Relaxation:
     @cached_property
     def constant(self) -> float:
         """Worth that every shift has: the least energy until its end at the earliest."""
-        jobs, released_s = self.world.jobs, 0.0
-        first = (jobs.after[0, : self.jobs] < 0).all(axis=1)
+        released_s, first = 0.0, (self.shift.after < 0).all(axis=1)
         if first.any():
-            released_s = float(jobs.release_s[0, : self.jobs][first].max())
+            released_s = float(self.shift.release_s[first].max())
         end_s = min(released_s, self.world.horizon_s)
         return self.weights.energy / 3600.0 * float(self.base_w.sum()) * end_s
 
@@ -285,20 +308,20 @@ class Relaxation:
     def cliques(self) -> list[set[int]]:
         """Sets of plans of which only one can be executed at a time."""
         world, pieces = self.world, self.pieces
-        stations: dict[int, set[int]] = {}
+        stations: dict[int, set[str]] = {}
         arm_of: dict[int, int] = {}
         for plan, arm, job in np.unique(np.stack([pieces.plan, pieces.arm, pieces.job]), axis=1).T.tolist():
             arm_of[plan] = arm
-            needed = {s for s in world.jobs.stations[0, job].tolist() if s >= 0}
+            needed = set(world.kinds[self.shift.kind[job]].stations)
             stations[plan] = stations.get(plan, needed) & needed
         graph: nx.Graph[int] = nx.Graph()
         graph.add_nodes_from(arm_of)
-        volume = world.plans.volume
+        conflicts = world.conflicts
         graph.add_edges_from(
             (p, q)
             for p in arm_of
             for q in arm_of
-            if p < q and (arm_of[p] == arm_of[q] or stations[p] & stations[q] or world.conflicts[volume[p], volume[q]])
+            if p < q and (arm_of[p] == arm_of[q] or stations[p] & stations[q] or conflicts[p, q])
         )
         found = []
         for clique in nx.find_cliques(graph):
@@ -335,8 +358,7 @@ class Relaxation:
                 np.concatenate([np.full(count, sign), np.full(self.jobs, -sign)]),
                 np.zeros(self.jobs),
             )
-        before = self.world.jobs.after[0, : self.jobs]
-        waits = [(job, int(other)) for job in range(self.jobs) for other in before[job] if other >= 0]
+        waits = [(job, other) for job, before in enumerate(self.shift.after.tolist()) for other in before if other >= 0]
         for job, other in waits:
             table.add_row(self.columns.jobs[[job, other]], np.array([1.0, -1.0]))
         self.add_losses(table, self.world.horizon_s)
@@ -395,40 +417,45 @@ class HeatBudget:
 
     def _integral(self, heat_w: Array) -> Array:
         """Integral of the temperatures over every interval, K·s, [arm, tick, node], with some heat, W, likewise."""
-        world, thermal = self.relaxation.world, self.relaxation.world.thermal
+        world, thermal, ambient_c = self.relaxation.world, self.relaxation.world.thermal, self.relaxation.ambient_c
         temp_c = np.empty((heat_w.shape[0], world.ticks + 1, heat_w.shape[2]))
-        temp_c[:, 0] = world.start_c
+        temp_c[:, 0] = self.relaxation.start_c
         for tick in range(world.ticks):
             temp_c[:, tick + 1] = advance(
-                temp_c[:, tick], heat_w[:, tick], world.ambient_c[tick], world.phi, world.gamma, thermal.to_ambient
+                temp_c[:, tick], heat_w[:, tick], ambient_c[tick], *self._step, thermal.to_ambient
             )
-        load_w = heat_w + thermal.to_ambient[:, None] * world.ambient_c.T[..., None]
+        load_w = heat_w + thermal.to_ambient[:, None] * ambient_c.T[..., None]
         stored_j = thermal.capacity[:, None] * np.diff(temp_c, axis=1)
         return np.linalg.solve(thermal.laplacian[:, None], (world.dt_s * load_w - stored_j)[..., None])[..., 0]
 
     @cached_property
+    def _step(self) -> tuple[Array, Array]:
+        """Matrices of a step, [arm, node, node]."""
+        return self.relaxation.world.thermal.step_matrices(self.relaxation.world.dt_s)
+
+    @cached_property
     def highest_c(self) -> float:
         """A temperature that no motor exceeds."""
-        world = self.relaxation.world
-        friction_w = np.concatenate([world.plans.friction_w.reshape(-1, JOINTS), world.rest.friction_w]).max(axis=0)
-        housing_w = np.zeros_like(world.start_c)
-        housing_w[:, HOUSING] = friction_w + world.motors.idle_w
-        settled_c = world.thermal.steady(housing_w, np.full(len(world.arms), world.ambient_c.max()))
-        return float(max(world.limits.error_c, settled_c.max(), world.start_c.max(), world.ambient_c.max()))
+        world, start_c, ambient_c = self.relaxation.world, self.relaxation.start_c, self.relaxation.ambient_c
+        friction_w = [drive_of(each)[1].reshape(-1, JOINTS) for each in (world.tables.plans, world.tables.start)]
+        housing_w = np.zeros_like(start_c)
+        housing_w[:, HOUSING] = np.concatenate(friction_w).max(axis=0) + world.motors.idle_w
+        settled_c = world.thermal.steady(housing_w, np.full(len(world.arms), ambient_c.max()))
+        return float(max(world.tables.error_c, settled_c.max(), start_c.max(), ambient_c.max()))
 
     @cached_property
     def longest_loss_s(self) -> float:
         """Longest time that one fault can cost an arm."""
-        world, limits = self.relaxation.world, self.relaxation.world.limits
-        temp_c = np.full_like(world.start_c, self.highest_c)
+        world, limits = self.relaxation.world, self.relaxation.world.tables
+        temp_c = np.full_like(self.relaxation.start_c, self.highest_c)
         brakes_w = np.zeros_like(temp_c)
-        if not limits.power_off_on_fault:
+        if not limits.power_off:
             brakes_w[:, HOUSING] = world.motors.idle_w
-        air_c = world.ambient_c.max(axis=0)
+        air_c = self.relaxation.ambient_c.max(axis=0)
         for tick in range(world.ticks):
             if temp_c[:, WINDING].max() < limits.restart_c:
                 return min(world.horizon_s, (tick + 1) * world.dt_s + limits.clear_s)
-            temp_c = advance(temp_c, brakes_w, air_c, world.phi, world.gamma, world.thermal.to_ambient)
+            temp_c = advance(temp_c, brakes_w, air_c, *self._step, world.thermal.to_ambient)
         return world.horizon_s
 
     def violated(self, shares: Array) -> list[tuple[Array, Array, float]]:
@@ -473,7 +500,7 @@ class HeatBudget:
             total: Integral of the temperatures until each tick, K·s, [tick + 1, joint].
         """
         relaxation, dt_s = self.relaxation, self.relaxation.world.dt_s
-        warning_c = relaxation.world.limits.warning_c
+        warning_c = relaxation.world.tables.warning_c
         count = max(1, round(length_s / float(relaxation.edges_s[1])))
         first = np.arange(0, max(1, relaxation.periods - count + 1), max(1, count // 2))
         last = np.minimum(first + count, relaxation.periods)
@@ -489,7 +516,7 @@ class HeatBudget:
     def _budget(self, arm: int, joint: int, first: int, last: int) -> tuple[Array, Array, float]:
         """The budget of a motor in a window of periods: columns, their values, and the bound."""
         relaxation, world, pieces = self.relaxation, self.relaxation.world, self.relaxation.pieces
-        edges_s, warning_c = relaxation.edges_s, world.limits.warning_c
+        edges_s, warning_c = relaxation.edges_s, world.tables.warning_c
         low, high = self._effect(arm, joint, float(edges_s[first]), float(edges_s[last]))
         own = np.flatnonzero((pieces.arm == arm) & (pieces.period < last + 1))
         joules = pieces.cycles_s[own, None] * self._surplus_w[own]
@@ -517,8 +544,8 @@ class HeatBudget:
         effect = np.maximum((decay * (modes[joint] / root[joint])) @ (modes / root[:, None]).T, 0.0)
         # Backward in time no node's effect falls faster than it loses heat: a bound between the points.
         between = np.exp(-np.diag(thermal.laplacian[arm]) / thermal.capacity[arm] * step_s)
-        plans = world.plans.times_s
-        reach = int(np.ceil((max(float(plans[:, 0].max()), relaxation.tail_s)) / step_s)) + 1
+        approach_s = float(relaxation.times_s[:, 0].max())
+        reach = int(np.ceil((max(approach_s, relaxation.tail_s)) / step_s)) + 1
         size = 2 * reach + 1
         low = minimum_filter1d(effect, size, axis=0, mode="nearest") * between
         high = maximum_filter1d(effect, size, axis=0, mode="nearest") / between

@@ -97,7 +97,7 @@ def perform(arm: Arm, plan: Plan, *, start_c: Array, ambient_c: float, tick_s: f
     ticks = -(-length // samples)
     job = Job(name="performed", work=plan.work, repetitions=1, release_s=0.0, due_s=1e9, value=1.0)
     single = replace(arm, model=Blind(), plans={plan.work: (plan,)})
-    world, plans = build_world(
+    world = build_world(
         [single],
         [[job]],
         limits=ThermalLimits(warning_c=NEVER_C, error_c=2 * NEVER_C, restart_c=1.0),
@@ -107,8 +107,8 @@ def perform(arm: Arm, plan: Plan, *, start_c: Array, ambient_c: float, tick_s: f
         ambient_c=np.full((ticks, 1), ambient_c),
         start_warm=False,
     )
-    world = replace(world, start_c=np.array(start_c, dtype=float)[None])
-    plant = MujocoPlant([arm.robot], plans, arm.rest_tau[None])
+    world.tables.modal["start_c"] = start_c
+    plant = MujocoPlant([arm.robot], world.plans, arm.rest_tau[None])
     state = initial(world)
     offsets_s = np.arange(1, samples + 1) / RATE_HZ
     read, temps = [], [state.temp_c[0, 0, WINDING]]

@@ -15,10 +15,10 @@ from fleet.arm.space import SpaceTable, space_table
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.bus.exchange.memory import Exchange
 from fleet.difficulty import Blind
+from fleet.engine.batch import Shift
 from fleet.engine.profile_plant import ProfilePlant
-from fleet.engine.state import World
-from fleet.engine.tables import Tables, tables_of
-from fleet.engine.world import Arm, build_world, warm_start
+from fleet.engine.tables import Tables
+from fleet.engine.world import Arm, World, build_world, warm_start
 from fleet.env.lookahead import CellSimulator
 from fleet.errors import FleetError, InfeasibleJob, ScenarioError
 from fleet.files import cache_folder
@@ -26,7 +26,7 @@ from fleet.jit import is_compiled
 from fleet.job import Job, Work
 from fleet.motion import Plan
 from fleet.robot import Robot
-from fleet.seeding import shift_seeds
+from fleet.seeding import key_of, shift_seeds
 from scenarios.cell_layout import cell_of, near_of
 from scenarios.extras import require_extra
 from scenarios.prepare.arms import REASONS, PlannedArm, air_offsets, plan_arms, problems_of
@@ -35,7 +35,7 @@ from scenarios.prepare.shipped import is_shipped
 from scenarios.prepare.surprise import arms_with_surprises
 from scenarios.progress import Count, Progress, check_progress, quiet
 from scenarios.spec.calendar import absences_of
-from scenarios.spec.jobs import JobSampler, all_works, rehearsal_works, weights_of
+from scenarios.spec.jobs import JobSampler, all_works, kinds_of, rehearsal_works, weights_of
 from scenarios.spec.load import scenario_with
 from scenarios.spec.options import RISK, BusName, DifficultyName, PlantName, RiskName
 from scenarios.spec.parse import choose
@@ -269,18 +269,11 @@ def _with_oracle(scenario: Scenario, arm: Arm) -> Arm:
     return replace(arm, model=model, known=(arm.thermal, arm.motors), drift_k_per_s=0.0)
 
 
-def world_of(
-    fleet: Fleet, jobs: Sequence[Job], warmer_k: float = 0.0, absences: np.ndarray | None = None
-) -> tuple[World, tuple[Plan, ...]]:
-    """The world of a shift with these jobs, and the plan of each row of its plan table.
-
-    Args:
-        warmer_k: Added to every temperature of the cell, at the start and ambient.
-        absences: As in `build_world`.
-    """
+def world_of(fleet: Fleet, jobs: Sequence[Job], absences: np.ndarray | None = None) -> World:
+    """The world of a shift with these jobs; arguments as in `build_world`."""
     scenario = fleet.scenario
     times = (np.arange(scenario.ticks) + 0.5) * scenario.decision_interval_s
-    world, plans = build_world(
+    return build_world(
         fleet.arms,
         [jobs],
         limits=scenario.limits,
@@ -292,45 +285,61 @@ def world_of(
         space=fleet.space.rows,
         absences=absences,
     )
-    if warmer_k:
-        warmed = ("ambient_c", "start_c", "start_housing_c")
-        world = replace(world, **{name: getattr(world, name) + warmer_k for name in warmed})
-    return world, plans
 
 
 @dataclass(frozen=True, eq=False)
 class ShiftFactory:
-    """Makes the episode of a seed for one fleet."""
+    """Makes the shifts of a fleet: for the batch as arrays, for the single environment as episodes."""
 
     fleet: Fleet
     plant: PlantName = "profile"
 
     @cached_property
-    def _samplers(self) -> tuple[JobSampler, ...]:
-        return tuple(JobSampler(fleet.scenario) for fleet in self.fleet.all)
+    def worlds(self) -> tuple[World, ...]:
+        """Of the fleet and of its variants, with a job of each kind of the scenario."""
+        return tuple(world_of(each, kinds_of(each.scenario)) for each in self.fleet.all)
+
+    @cached_property
+    def _sampler(self) -> JobSampler:
+        return JobSampler(self.fleet.scenario)
+
+    def draw(self, seed: np.random.SeedSequence, *, named: bool = False) -> Shift:
+        """The shift of a seed.
+
+        Args:
+            named: With the names of its jobs.
+        """
+        conditions = self.fleet.conditions(seed)
+        jobs_seed, sensor_seed = shift_seeds(seed)
+        return self._sampler.shift(
+            jobs_seed,
+            conditions.arrivals,
+            named=named,
+            fleet=conditions.fleet,
+            ambient_offset_k=conditions.ambient_k,
+            noise_key=key_of(sensor_seed),
+            absences=absences_of(self.fleet.all[conditions.fleet].scenario, seed),
+        )
 
     def __call__(self, seed: np.random.SeedSequence) -> "Episode":
-        """Draw the jobs and build the world; the same seed gives the same episode."""
+        """The episode of a seed; the same seed gives the same episode."""
         from fleet.engine.shift import Episode
 
-        chosen, warmer_k, rate = self.fleet.conditions(seed)
-        fleet = self.fleet.all[chosen]
-        scenario, arms = fleet.scenario, fleet.arms
-        jobs_seed, sensor_seed = shift_seeds(seed)
-        jobs, absences = self._samplers[chosen].jobs(jobs_seed, rate), absences_of(scenario, seed)
-        world, plans = world_of(fleet, jobs, warmer_k, absences)
-        robots, rest_tau = [arm.robot for arm in arms], np.stack([arm.rest_tau for arm in arms])
-        others = {plan: other for arm in arms for plan, other in arm.executed.items()}
-        executed = tuple(others.get(plan, plan) for plan in plans)
+        shift = self.draw(seed, named=True)
+        fleet, world = self.fleet.all[shift.fleet], self.worlds[shift.fleet]
+        world = replace(world, shifts=(replace(shift, fleet=0),))
+        robots, rest_tau = [arm.robot for arm in fleet.arms], np.stack([arm.rest_tau for arm in fleet.arms])
+        others = {plan: other for arm in fleet.arms for plan, other in arm.executed.items()}
+        executed = tuple(others.get(plan, plan) for plan in world.plans)
         plant: Plant
         if self.plant == "mujoco":
             from fleet.arm.plant import MujocoPlant
 
-            plant = MujocoPlant(robots, executed, rest_tau, scenario.places, scenario.fixtures)
+            plant = MujocoPlant(robots, executed, rest_tau, fleet.scenario.places, fleet.scenario.fixtures)
         else:
             plant = ProfilePlant(executed, np.stack([robot.home_q() for robot in robots]), rest_tau)
-        twins = tuple(arm.model.version for arm in arms)
-        return Episode(world=world, plant=plant, twins=twins, sensors=sensor_seed)
+        twins = tuple(arm.model.version for arm in fleet.arms)
+        return Episode(world=world, plant=plant, twins=twins, sensors=shift_seeds(seed)[1])
 
 
 def with_surprises(fleet: Fleet) -> Fleet:
@@ -365,9 +374,10 @@ def simulator_of(fleet: Fleet, tables: Tables) -> CellSimulator:
 
 
 def simulator_of_shift(fleet: Fleet, seed: int) -> CellSimulator:
-    """The simulator of a cell for the shift of one seed, in which every job is a kind of its own."""
-    world = ShiftFactory(as_known(fleet))(np.random.SeedSequence(seed)).world
-    return simulator_of(fleet, tables_of(world)[0])
+    """The simulator of a cell for the shift of one seed."""
+    known = as_known(fleet)
+    variant = known.all[fleet.conditions(np.random.SeedSequence(seed)).fleet]
+    return simulator_of(fleet, world_of(variant, kinds_of(variant.scenario)).tables)
 
 
 def let_plan(policy: Policy, fleet: Fleet, env: "AllocationEnv", seed: int) -> None:

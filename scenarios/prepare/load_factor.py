@@ -21,8 +21,9 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import csr_array, vstack
 
-from fleet.engine.state import World
-from fleet.heat.thermal import WINDING, drive_heat
+from fleet.engine.tables import drive_of
+from fleet.engine.world import World
+from fleet.heat.thermal import NODES, WINDING, drive_heat
 
 Array = np.ndarray
 
@@ -53,13 +54,14 @@ class LoadFactor:
 
 def load_factor(world: World) -> LoadFactor:
     """Thermal, blind and time load of the jobs of env 0."""
-    jobs = np.flatnonzero(world.jobs.exists[0] & (world.offers.plan[0] >= 0).any(axis=(0, 2)))
-    plan = world.offers.plan[0][:, jobs, 0]
+    shift, work = world.shifts[0], world.tables.work["plan"][0]  # [kind, arm, plan]
+    jobs = np.flatnonzero((work[shift.kind] >= 0).any(axis=(1, 2)))
+    plan = work[shift.kind[jobs], :, 0].T
     possible = plan >= 0
     if not possible.any():
         return LoadFactor(0.0, 0.0, 0.0, 0.0)
-    times = world.plans.times_s[plan]
-    length_s = times[..., 0] + world.jobs.repetitions[0, jobs] * times[..., 1] + times[..., 2]
+    times = world.tables.plans["times_s"][plan]
+    length_s = times[..., 0] + shift.repetitions[jobs] * times[..., 1] + times[..., 2]
     length_s = np.where(possible, length_s, 0.0)
     heat = _heat_share(world, plan) * length_s / world.horizon_s
     busy = length_s / np.maximum(_present_s(world), world.dt_s)[:, None]
@@ -72,26 +74,28 @@ def load_factor(world: World) -> LoadFactor:
 def _present_s(world: World) -> Array:
     """Length of the shift without breaks and failures, s, [arm]."""
     present = np.ones((len(world.arms), world.ticks), bool)
-    for each in world.absences:
+    for each in world.shifts[0].absences:
         present[each["arm"], each["begin"] : each["end"]] = False
     return present.sum(axis=1) * world.dt_s
 
 
 def _heat_share(world: World, plan: Array) -> Array:
     """Share of the room up to the warning limit that the cycle of each plan uses in steady state, [arm, job]."""
-    at_limit = np.full(world.start_c.shape, world.limits.warning_c)
-    ambient_c = world.ambient_c.mean(axis=0)
+    tables = world.tables
+    at_limit = np.full((len(world.arms), NODES), tables.warning_c)
+    ambient_c = tables.ambient_c[0].mean(axis=0) + world.shifts[0].ambient_offset_k
 
     def steady_c(current_sq: Array, friction_w: Array) -> Array:
         """Motor temperatures [arm, joint] for the losses at the limit: linear, so shares of time add up."""
         heat_w = drive_heat(at_limit, current_sq, friction_w, world.motors)
         return world.thermal.steady(heat_w, ambient_c)[..., WINDING]
 
-    rest_c = steady_c(world.rest.current_sq, world.rest.friction_w)
-    room_k = np.maximum(world.limits.warning_c - rest_c, 1.0)  # an arm that idles at the limit has none left
+    rest_c = steady_c(*drive_of(tables.start[0]))
+    room_k = np.maximum(tables.warning_c - rest_c, 1.0)  # an arm that idles at the limit has none left
     shares = np.empty(plan.shape)
     for j, rows in enumerate(np.maximum(plan.T, 0)):
-        hot_c = steady_c(world.plans.current_sq[rows, 1], world.plans.friction_w[rows, 1])
+        current_sq, friction_w = drive_of(tables.plans[rows])
+        hot_c = steady_c(current_sq[:, 1], friction_w[:, 1])
         shares[:, j] = np.maximum((hot_c - rest_c) / room_k, 0.0).max(axis=-1)
     return shares
 

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from fleet.engine.state import DONE, EXPIRED, GIVEN_UP, State, World
+from fleet.engine.state import DONE, EXPIRED, GIVEN_UP, State
+from fleet.engine.world import World
 from fleet.events import Event
 from fleet.heat.effects import arrhenius_rate, life_used, most_drift_m, seconds_above, segment_temperatures, surface_c
 from fleet.heat.thermal import HOUSING, WINDING
@@ -155,12 +156,13 @@ def metrics_of(
         finds_contacts: Whether the plant detects contacts.
     """
     time_s = float(state.tick[0] * world.dt_s)
-    jobs = slice(int(world.jobs.exists[0].sum()))
-    release_s, due_s, value = (column[0, jobs] for column in (world.jobs.release_s, world.jobs.due_s, world.jobs.value))
+    shift = world.shifts[0]
+    jobs, release_s, due_s = slice(len(shift.kind)), shift.release_s, shift.due_s
+    value = world.tables.value[0, shift.kind]
     finished_s = state.finished_s[0, jobs][state.status[0, jobs] == DONE]
     late_s = np.maximum(finished_s - due_s[state.status[0, jobs] == DONE], 0.0)
     released = release_s <= time_s
-    release = dict(zip(world.jobs.names[0], release_s.tolist(), strict=True))
+    release = dict(zip(shift.names, release_s.tolist(), strict=True))
     first_award: dict[str, float] = {}
     for event in events:
         if event.kind == "award":

@@ -10,7 +10,8 @@ from typing import Any, Literal  # Any: values of a card
 
 import numpy as np
 
-from fleet.engine.state import DONE, EXPIRED, GIVEN_UP, RUNNING, WAITING, State, World
+from fleet.engine.state import DONE, EXPIRED, GIVEN_UP, RUNNING, WAITING, State
+from fleet.engine.world import World
 from fleet.errors import nearest
 from fleet.events import Event
 from fleet.observation import Observation
@@ -343,19 +344,19 @@ class ShiftLog:
 
 def job_records(world: World, state: State) -> tuple[JobRecord, ...]:
     """The jobs of env 0 in the order of the shift."""
-    jobs = world.jobs
+    shift = world.shifts[0]
     return tuple(
         JobRecord(
-            job=jobs.names[0][j],
+            job=name,
             state=JOB_STATES[int(state.status[0, j])],
-            release_s=float(jobs.release_s[0, j]),
-            due_s=float(jobs.due_s[0, j]),
+            release_s=float(shift.release_s[j]),
+            due_s=float(shift.due_s[j]),
             finished_s=float(state.finished_s[0, j]) if state.status[0, j] == DONE else None,
-            value=float(jobs.value[0, j]),
-            payload_kg=float(jobs.payload_kg[0, j]),
-            cycles=int(jobs.repetitions[0, j]),
+            value=world.kinds[shift.kind[j]].value,
+            payload_kg=world.kinds[shift.kind[j]].work.payload_kg,
+            cycles=int(shift.repetitions[j]),
         )
-        for j in np.flatnonzero(jobs.exists[0]).tolist()
+        for j, name in enumerate(shift.names)
     )
 
 

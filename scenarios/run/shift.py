@@ -118,7 +118,7 @@ def run(
         env.close()
     state, world = env.truth, env.world
     events = tuple(sorted(env.events, key=lambda event: event.time_s))
-    heat = recorder.heat or HeatUse(world.start_c, fleet.scenario.people.burn_c)
+    heat = recorder.heat or HeatUse(state.temp_c[0].astype(float), fleet.scenario.people.burn_c)
     finds_contacts = not env.episode.plant.follows_plans
     card = card_of(
         spec,

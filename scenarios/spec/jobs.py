@@ -9,13 +9,15 @@ The two factors of the price, `fleet.engine.batch.FaultPrice`, follow from the s
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
+from functools import cached_property
 from itertools import product
+from typing import Any
 
 import numpy as np
 
 from fleet.arrivals import ArrivalTable, arrival_table, sample_arrivals, scale_rate
-from fleet.engine.batch import FaultPrice, RewardWeights
+from fleet.engine.batch import FaultPrice, RewardWeights, Shift
 from fleet.errors import ScenarioError
 from fleet.heat.motor import gen3_motors
 from fleet.heat.thermal import NODES, WINDING, gen3_network, node_heat, thermal_model
@@ -54,21 +56,17 @@ def all_works(scenario: Scenario) -> tuple[Work, ...]:
     return tuple(dict.fromkeys(work for stream in scenario.jobs for work in works_of(scenario, stream)))
 
 
-@dataclass(frozen=True, eq=False)
-class SampledJobs:
-    """The jobs of one shift as arrays [job], in order of release, then of stream and number."""
-
-    stream: Array
-    """Index into the scenario's streams."""
-    number: Array
-    """Number of the job in its stream, from 0."""
-    payload: Array
-    """Index into the stream's payloads."""
-    extra: Array
-    """Repetitions above the minimum of the stream."""
-    release_s: Array
-    after: Array
-    """Indices of the jobs that must finish first, int [job, n], −1 for none."""
+def kinds_of(scenario: Scenario) -> list[Job]:
+    """One job of every kind in a scenario's streams: each payload, each number of repetitions."""
+    return [
+        Job(name=f"{stream.name}/{p}/{repetitions}", work=work, alternatives=others, repetitions=repetitions,
+            release_s=0.0, due_s=0.0, value=stream.value)
+        for stream in scenario.jobs
+        for p, payload_kg in enumerate(stream.payload_kg)
+        for work, *rest in [alternatives_of(scenario, stream, payload_kg)]
+        for others in [tuple(rest)]
+        for repetitions in range(stream.repetitions[0], stream.repetitions[1] + 1)
+    ]  # fmt: skip
 
 
 @kernel
@@ -130,19 +128,21 @@ class JobSampler:
 
     def __init__(self, scenario: Scenario) -> None:
         streams = scenario.jobs
-        self._streams = streams
-        self._works = [[alternatives_of(scenario, each, load) for load in each.payload_kg] for each in streams]
-        self._others = [[works[1:] for works in of_stream] for of_stream in self._works]
+        self._scenario, self._streams = scenario, streams
         self._arrivals = [stream.arrivals for stream in streams]
         self._horizon_s = scenario.ticks * scenario.decision_interval_s
         self._table = arrival_table(self._arrivals, self._horizon_s)
         lowest, most = (np.array([stream.repetitions[i] for stream in streams], dtype=int) for i in (0, 1))
-        self.fewest = lowest
+        self._fewest = lowest
         """Fewest repetitions of each stream, int [stream]."""
-        self.choices = np.stack(
+        self._choices = np.stack(
             [np.array([len(stream.payload_kg) for stream in streams], dtype=int), most - lowest + 1], axis=-1
         )
         """Numbers of possible payloads and repetitions, int [stream, 2]."""
+        self._first_kind = np.cumsum([0, *self._choices.prod(axis=1)])[:-1]
+        """Where the kinds of each stream begin; see `kinds_of`."""
+        self._expires = np.array([stream.due == "hard" for stream in streams], dtype=bool)
+        self._due_s = np.array([stream.due_s for stream in streams], dtype=float)
         index = {stream.name: i for i, stream in enumerate(streams)}
         waits = max((len(stream.after) for stream in streams), default=0) or 1
         self._after = np.full((len(streams), waits), -1)
@@ -150,11 +150,19 @@ class JobSampler:
             self._after[i, : len(stream.after)] = [index[name] for name in stream.after]
         self._room = 64
 
-    def sample(self, seed: np.random.SeedSequence, rate: float = 1.0) -> SampledJobs:
-        """The jobs of one shift.
+    @cached_property
+    def _kinds(self) -> list[Job]:
+        return kinds_of(self._scenario)
+
+    def shift(
+        self, seed: np.random.SeedSequence, rate: float = 1.0, *, named: bool = True, **conditions: Any
+    ) -> Shift:  # of several types
+        """The jobs of one shift in order of release, then of stream and number.
 
         Args:
             rate: Factor on the rates of Poisson streams and repeated batches.
+            named: With the names of the jobs.
+            conditions: Other fields of the shift.
         """
         table = self._table
         if rate != 1.0:
@@ -163,34 +171,39 @@ class JobSampler:
         while True:
             release_s = np.empty(self._room)
             job, after = np.empty((self._room, 4), int), np.empty((self._room, self._after.shape[1]), int)
-            total = sample_jobs.chosen()(table, key, self.choices, self._after, release_s, job, after)
+            total = sample_jobs.chosen()(table, key, self._choices, self._after, release_s, job, after)
             if total >= 0:
                 break
             self._room *= 2
         stream, number, payload, extra = job[:total].T
-        return SampledJobs(stream, number, payload, extra, release_s[:total], after[:total])
+        numbered = zip(stream.tolist(), number.tolist(), strict=True) if named else ()
+        return Shift(
+            kind=self._first_kind[stream] + payload * self._choices[stream, 1] + extra,
+            release_s=release_s[:total],
+            due_s=release_s[:total] + self._due_s[stream],
+            repetitions=self._fewest[stream] + extra,
+            expires=self._expires[stream],
+            after=after[:total],
+            names=tuple(job_name(self._streams[i], n) for i, n in numbered),
+            **conditions,
+        )
 
     def jobs(self, seed: np.random.SeedSequence, rate: float = 1.0) -> tuple[Job, ...]:
-        """The jobs of one shift in order of release; `rate` as in `sample`."""
-        sampled, streams = self.sample(seed, rate), self._streams
-        stream, number, payload, release_s = (
-            getattr(sampled, name).tolist() for name in ("stream", "number", "payload", "release_s")
-        )
-        repetitions = (self.fewest[sampled.stream] + sampled.extra).tolist()
-        names = [job_name(streams[i], n) for i, n in zip(stream, number, strict=True)]
+        """The jobs of `shift`."""
+        shift = self.shift(seed, rate)
+        columns = (shift.kind, shift.release_s, shift.due_s, shift.after, shift.expires)
         return tuple(
-            Job(
-                name=names[j],
-                work=self._works[i][payload[j]][0],
-                alternatives=self._others[i][payload[j]],
-                repetitions=repetitions[j],
-                release_s=release_s[j],
-                due_s=release_s[j] + streams[i].due_s,
-                value=streams[i].value,
-                after=tuple(names[k] for k in after if k >= 0),
-                expires=streams[i].due == "hard",
+            replace(
+                self._kinds[kind],
+                name=name,
+                release_s=release_s,
+                due_s=due_s,
+                after=tuple(shift.names[k] for k in after if k >= 0),
+                expires=expires,
             )
-            for j, (i, after) in enumerate(zip(stream, sampled.after.tolist(), strict=True))
+            for name, kind, release_s, due_s, after, expires in zip(
+                shift.names, *(column.tolist() for column in columns), strict=True
+            )
         )
 
 

@@ -1,6 +1,7 @@
 """The learned policy: what it must not depend on, that it learns, and that it is kept."""
 
 import json
+from dataclasses import replace
 from itertools import islice
 from math import exp
 
@@ -23,8 +24,7 @@ from agents.learned.policy import (
     sets_of,
 )
 from agents.learned.ppo import Chooser, PpoConfig, Trainer, advantages, imitate
-from fleet.engine.batch import Shift, shifts_of
-from fleet.engine.tables import tables_of
+from fleet.engine.batch import Shift
 from fleet.env.adapters.torchrl import TorchRLEnv
 from fleet.env.vector import BatchEnv, Library
 from fleet.errors import CheckpointError
@@ -111,13 +111,11 @@ def unequal(small) -> Library:
         for i in range(40)
     ]
     world, _ = small.shop([jobs], arms=arms, ticks=30, slots=4)
-    tables, drawn = tables_of(world)
 
     def draw(seed: np.random.SeedSequence) -> Shift:
-        (shift,) = shifts_of(drawn, [key_of(seed)])
-        return shift
+        return replace(world.shifts[0], noise_key=key_of(seed))
 
-    return Library(world.arms, world.slots, tables, draw)
+    return Library(world.arms, world.slots, world.tables, draw)
 
 
 def trainer(small, **changes) -> Trainer:

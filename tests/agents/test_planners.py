@@ -13,8 +13,7 @@ from agents.planners import NONE, Mpc, RollingHorizon, Sequences, pack
 from agents.policy import WAIT, EveryArm, Local, PlanningPolicy
 from agents.registry import RULES, make_policy
 from agents.schedules import Schedules
-from fleet.engine.batch import Engine, RewardWeights, empty_parts, shifts_of
-from fleet.engine.tables import tables_of
+from fleet.engine.batch import Engine, RewardWeights, empty_parts
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.errors import FleetError
 from fleet.observation import Layout, Observation
@@ -26,6 +25,7 @@ from scenarios.spec.load import load
 from tests.agents.observations import observation
 from tests.exhaustive import optimum
 from tests.profiles import examples
+from tests.shifts import with_work
 
 WARNING_C = 60.0
 
@@ -135,18 +135,16 @@ WEIGHTS = RewardWeights(tardiness=-0.5, faults=-10.0)
 
 
 def simulator_of(world, weights=WEIGHTS):
-    tables, _ = tables_of(world)
-    tables.work["difficulty"] = np.nan  # the arms share it
+    tables = with_work(world, difficulty=np.nan).tables  # the arms share it
     return CellSimulator(tables, len(world.arms), world.slots, weights)
 
 
 def begun(world):
     """An engine at the beginning of the shift of a world, and both parts of its observations."""
-    tables, drawn = tables_of(world)
     layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
-    engine = Engine(tables, 1, layout, WEIGHTS, jobs=len(world.jobs.names[0]))
+    engine = Engine(world.tables, 1, layout, WEIGHTS, jobs=world.jobs)
     parts = empty_parts(layout, 1)
-    engine.reset(np.arange(1), shifts_of(drawn, [0]))
+    engine.reset(np.arange(1), world.shifts)
     engine.observe(np.arange(1), parts)
     return engine, parts
 
@@ -206,8 +204,8 @@ def test_the_simulator_goes_on_as_the_true_shift_does(small, seed, ticks):
     shifts = small.Shifts(arms=3, jobs=6, ticks=40, slots=6, crowding=0.3)
     jobs = [replace(j, release_s=0.0, after=()) for j in shifts.drawn(np.random.SeedSequence(seed))[0]]
     rng, (world, _) = np.random.default_rng(seed), shifts.shop(jobs)
-    difficulty = rng.uniform(0.0, 3.0, world.offers.difficulty.shape)
-    world = replace(world, offers=replace(world.offers, difficulty=difficulty))
+    difficulty = rng.uniform(0.0, 3.0, world.tables.work.shape)
+    world = with_work(world, difficulty=difficulty)
     schedule = Schedules(
         rng.integers(0, 3, (1, 6)), np.zeros((1, 6), int), rng.uniform(0, 1, (1, 6)), rng.uniform(0, 300, (1, 6))
     )
@@ -235,10 +233,31 @@ def test_a_later_reward_is_worth_less(small):
     whole = Schedules(np.zeros((1, 1), int), np.zeros((1, 1), int), np.zeros((1, 1)), np.zeros((1, 1)))
     value, later = (float(simulator.run(whole, each).reward[0]) for each in (np.ones(world.ticks), discount))
     finished = int(np.log2(value / later))
-    assert value == world.jobs.value[0, 0]
+    assert value == world.kinds[0].value
     assert later == value * 0.5**finished
     delayed = whole._replace(not_before_s=np.full((1, 1), 30.0))
     assert simulator.run(delayed, discount).reward[0] == later / 8
+
+
+def test_a_simulator_has_no_jobs_and_precedence_of_the_shift_before(small):
+    """Two jobs at once by two arms, simulated anew and after a look at a longer shift in which one awaits another."""
+    shifts, content = small.Shifts(arms=2), [small.work(place) for place in ("bench", "press")]
+    pair = [small.job("a", content[0]), small.job("b", content[1])]
+    chain = [pair[0], replace(pair[1], after=("a",)), small.job("c", content[0])]
+    kinds, _ = shifts.shop(chain)
+    waiting, free = (
+        replace(kinds, shifts=shifts.shop(jobs)[0].shifts) for jobs in (chain, pair)
+    )  # of the same three kinds of jobs
+    both = Schedules(np.array([[0, 1]]), np.zeros((1, 2), int), np.zeros((1, 2)), np.zeros((1, 2)))
+    results = []
+    for before in ([], [waiting]):
+        simulator = simulator_of(kinds)
+        for world in (*before, free):
+            engine, parts = begun(world)
+            simulator.look(engine, 0, seen_by(world, engine, parts))
+        results.append(simulator.run(both, np.ones(kinds.ticks)))
+    assert results[0].start_s.tolist() == results[1].start_s.tolist() == [[0.0, 0.0]]
+    assert results[0].reward == results[1].reward
 
 
 def test_where_there_is_no_simulator_an_error_says_so(small):

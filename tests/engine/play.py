@@ -13,7 +13,7 @@ def play(world, plant, actions, log=None, state=None) -> list[Stepped]:
     state = initial(world) if state is None else state
     steps = []
     for tick in range(world.ticks):
-        chosen = np.zeros((world.envs, len(world.arms)), dtype=int)
+        chosen = np.zeros((len(world.shifts), len(world.arms)), dtype=int)
         if tick < len(actions):
             chosen[:] = actions[tick]
         steps.append(step(world, state, chosen, plant, log))

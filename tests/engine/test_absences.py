@@ -8,13 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.engine.batch import RewardWeights
-from fleet.engine.shift import Episode, ShiftRunner, open_jobs
+from fleet.engine.shift import Episode, open_jobs
 from fleet.engine.state import BROKEN, FINISH_CYCLE, FINISH_JOB, WAITING
 from fleet.env.lookahead import CellSimulator
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED
 from tests.engine.play import play, times
 from tests.profiles import examples
+from tests.shifts import Single
 
 CLAIM = 1
 
@@ -102,8 +103,8 @@ def test_an_arm_on_its_way_to_the_first_cycle_goes_home(small) -> None:
 def test_no_absent_arm_takes_a_job_and_each_goes_on_afterwards(small, seed, count) -> None:
     make = small.Shifts(arms=3, jobs=10, ticks=50, ambient_c=40.0, crowding=0.3, absences=count)
     episode = make(np.random.SeedSequence(seed))
-    runner, rng = ShiftRunner(episode, RewardWeights(), keep_events=True), np.random.default_rng(seed)
-    windows = episode.world.absences.tolist()
+    runner, rng = Single(episode, keep_events=True), np.random.default_rng(seed)
+    windows = episode.world.shifts[0].absences.tolist()
     while runner.tick < episode.world.ticks:
         absent = {a for a, begin, end, _ in windows if begin <= runner.tick < end}
         for a in range(3):
@@ -113,7 +114,7 @@ def test_no_absent_arm_takes_a_job_and_each_goes_on_afterwards(small, seed, coun
             down = any(a == b and begin <= runner.tick < end and kind == BROKEN for b, begin, end, kind in windows)
             assert not down or runner.state.mode[0, a] == FAULTED
         runner.step(np.array([rng.choice(np.flatnonzero(mask)) for mask in runner.mask]))
-    for event in runner.events:
+    for event in runner.env.events:
         if event.kind == "award":
             tick, arm = round(event.time_s / 10.0), int(event.arm.rpartition("_")[2])
             assert not any(arm == a and begin <= tick < end for a, begin, end, _ in windows)
@@ -130,7 +131,7 @@ def test_a_simulator_for_policies_knows_breaks_and_no_future_failures(small) -> 
     make = small.Shifts(arms=1, jobs=2)
     absences = [(0, 5, 9, FINISH_JOB), (0, 2, 4, BROKEN), (0, 0, 2, BROKEN)]
     world, plant = small.shop([make.drawn(np.random.SeedSequence(1))[0]], arms=1, absences=absences)
-    runner = ShiftRunner(Episode(world, plant, ("t",), np.random.SeedSequence(1)), RewardWeights())
+    runner = Single(Episode(world, plant, ("t",), np.random.SeedSequence(1)))
     simulator = CellSimulator(runner.engine.tables, 1, world.slots, RewardWeights())
     layout = runner.layout
     seen = layout.read_each(["arm_0"], runner.parts[0], runner.parts[1], runner.mask)
@@ -142,10 +143,12 @@ def test_a_simulator_for_policies_knows_breaks_and_no_future_failures(small) -> 
 def test_without_absences_nothing_changes(small) -> None:
     make = small.Shifts(arms=3, jobs=9, ticks=60, ambient_c=45.0)
     episode = make(np.random.SeedSequence(3))
-    late = replace(episode.world, absences=np.array([(0, 10**6, 10**6 + 1, BROKEN)], episode.world.absences.dtype))
+    (shift,) = episode.world.shifts
+    never = np.array([(0, 10**6, 10**6 + 1, BROKEN)], shift.absences.dtype)
+    late = replace(episode.world, shifts=(replace(shift, absences=never),))
     results = []
     for world in (episode.world, late):
-        runner, rng = ShiftRunner(replace(episode, world=world), RewardWeights()), np.random.default_rng(3)
+        runner, rng = Single(replace(episode, world=world)), np.random.default_rng(3)
         outcomes = []
         while runner.tick < world.ticks:
             outcomes.append(runner.step(np.array([rng.choice(np.flatnonzero(mask)) for mask in runner.mask])).tolist())

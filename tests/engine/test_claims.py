@@ -8,9 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.engine.shift import initial, open_jobs, step
-from fleet.engine.state import World
+from fleet.engine.world import World
 from fleet.telemetry import IDLE, WORKING
 from tests.profiles import examples
+from tests.shifts import with_conflicts, with_tables, with_work
 
 
 def world_of(small, places, arms=3, slots=4, **more):
@@ -20,24 +21,20 @@ def world_of(small, places, arms=3, slots=4, **more):
 
 
 def with_difficulty(world: World, difficulty) -> World:
-    """Return the world with other difficulties, broadcast to [env, arm, job, plan], which decide between claims."""
-    offers = world.offers
-    return replace(world, offers=replace(offers, difficulty=np.broadcast_to(difficulty, offers.difficulty.shape)))
+    """Return the world with other difficulties, broadcast to [arm, job, plan], which decide between claims."""
+    return with_work(world, difficulty=np.broadcast_to(np.swapaxes(difficulty, -3, -2), world.tables.work.shape))
 
 
 def with_two_plans(world: World) -> World:
     """Return the world in which each arm has a second plan for each job, with rows of its own."""
-    plans, offers, count = world.plans, world.offers, len(world.plans.volume)
-    twice = {name: np.concatenate([values, values]) for name, values in vars(plans).items()}
-    scores = ("difficulty", "p_saturation", "risk", "peak")
-    more = {name: np.concatenate([getattr(offers, name)] * 2, axis=-1) for name in scores}
-    rows = np.concatenate([offers.plan, offers.plan + count], axis=-1)
-    return replace(world, plans=replace(plans, **twice), offers=replace(offers, plan=rows, **more))
-
-
-def with_conflicts(world: World, conflicts) -> World:
-    """Return the world in which each plan has its own volume; conflicts are bool [plan, plan]."""
-    return replace(world, plans=replace(world.plans, volume=np.arange(len(conflicts))), conflicts=conflicts)
+    tables, second = world.tables, world.tables.work.copy()
+    second["plan"] += len(tables.plans)
+    return with_tables(
+        replace(world, plans=world.plans * 2),
+        plans=np.concatenate([tables.plans] * 2),
+        excluded=np.concatenate([tables.excluded] * 2),
+        work=np.concatenate([tables.work, second], axis=-1),
+    )
 
 
 def referee(slot_job, mask, stations, actions, difficulty, occupied, touches, away):
@@ -77,7 +74,7 @@ def test_awards_equal_the_reference(small, data) -> None:
     world, plant = world_of(small, pairs, arms=arms)
     world = with_two_plans(world)
     state, count = initial(world), len(places)
-    plan = world.offers.plan[0]
+    plan = world.tables.work["plan"][0].swapaxes(0, 1)
     size = int(plan.max()) + 1
     pairs = st.lists(st.tuples(st.integers(0, size - 1), st.integers(0, size - 1)), max_size=8)
     conflicts = np.zeros((size, size), bool)

@@ -5,23 +5,22 @@ import pytest
 
 from fleet.bus.exchange.channel import Channel
 from fleet.bus.exchange.memory import Exchange
-from fleet.engine.batch import RewardWeights
-from fleet.engine.shift import Episode, ShiftRunner
+from fleet.engine.shift import Episode
 from fleet.engine.step import FINISHED
 from fleet.motion import Drive
 from fleet.robot import ThermalLimits
+from tests.shifts import Single
 
 LIMITS = ThermalLimits(warning_c=56.0, error_c=60.0, restart_c=54.0, clear_s=25.0)
 
 
-def check_equal(episode: Episode, seed: int, **options) -> ShiftRunner:
+def check_equal(episode: Episode, seed: int, **options) -> Single:
     """Play a shift both ways, with legal and illegal actions, and assert that all results are equal."""
     records: tuple[list, list] = ([], [])
     arms = episode.world.arms
     slow, fast = (
-        ShiftRunner(
+        Single(
             episode,
-            RewardWeights(),
             compiled=compiled,
             keep_events=True,
             watch=record.append,
@@ -34,7 +33,7 @@ def check_equal(episode: Episode, seed: int, **options) -> ShiftRunner:
         for one, other in zip(slow.parts, fast.parts, strict=True):
             np.testing.assert_array_equal(other, one)
         np.testing.assert_array_equal(fast.mask, slow.mask)
-        np.testing.assert_array_equal(fast.slot_job, slow.slot_job)
+        np.testing.assert_array_equal(fast.engine.offers.slot_job, slow.engine.offers.slot_job)
         actions = np.array([rng.choice(np.flatnonzero(row)) for row in slow.mask])
         illegal = rng.random(len(actions)) < 0.1
         actions[illegal] = rng.integers(-2, episode.world.slots + 3, illegal.sum())
@@ -43,8 +42,8 @@ def check_equal(episode: Episode, seed: int, **options) -> ShiftRunner:
         done = bool(outcome[FINISHED])
         for name, values in slow.state.named().items():
             np.testing.assert_array_equal(getattr(fast.state, name), values, err_msg=name)
-    assert list(map(repr, fast.events)) == list(map(repr, slow.events))  # NaN equals itself in text
-    assert (fast.messages, fast.infos) == (slow.messages, slow.infos)
+    assert list(map(repr, fast.env.events)) == list(map(repr, slow.env.events))  # NaN equals itself in text
+    assert (fast.env.messages, fast.engine.infos.tolist()) == (slow.env.messages, slow.engine.infos.tolist())
     for one, other in zip(*records, strict=True):
         for name, values in vars(one).items():
             np.testing.assert_array_equal(getattr(other, name), values, err_msg=name)
@@ -54,7 +53,7 @@ def check_equal(episode: Episode, seed: int, **options) -> ShiftRunner:
 def test_compiled_and_uncompiled_agree_with_faults_and_returned_jobs(small) -> None:
     make = small.Shifts(arms=3, jobs=9, ticks=80, ambient_c=45.0, limits=LIMITS, absences=5)
     runs = [check_equal(make(np.random.SeedSequence(seed)), seed) for seed in range(3)]
-    kinds = {event.kind for run in runs for event in run.events}
+    kinds = {event.kind for run in runs for event in run.env.events}
     assert {"award", "lost", "illegal", "warning", "fault", "return", "recover", "finish", "home"} <= kinds
 
 
@@ -69,7 +68,7 @@ def test_compiled_and_uncompiled_agree_with_late_and_lost_messages(small) -> Non
     run = check_equal(
         make(np.random.SeedSequence(2)), 2, exchange=lambda arms: Exchange(arms, Channel(delay_s=20.0, loss=0.3))
     )
-    assert 0 < run.messages < 3 * 2 * (run.tick + 1)
+    assert 0 < run.env.messages < 3 * 2 * (run.tick + 1)
 
 
 def test_compiled_and_uncompiled_agree_with_a_plant_that_measures_its_drive(small) -> None:

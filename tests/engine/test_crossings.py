@@ -12,8 +12,8 @@ from scipy.optimize import brentq
 
 from fleet.engine.crossings import crossing_s, hottest_at, to_modes
 from fleet.engine.shift import Stepped, initial, open_jobs, step
-from fleet.engine.state import DONE, WAITING, World
-from fleet.engine.tables import tables_of
+from fleet.engine.state import DONE, WAITING
+from fleet.engine.world import World
 from fleet.events import Event
 from fleet.heat.thermal import NODES, WINDING
 from fleet.robot import ThermalLimits
@@ -75,7 +75,7 @@ def winding_after(world: World, start_c, heat_w, seconds: float) -> float:
 def test_crossing_times_equal_brentq(small, start_c) -> None:
     """Also if the search hits the limit exactly; the time is never before the crossing."""
     world, _ = small.shop([[small.job("a")]])
-    net = tables_of(world)[0].modal[0, 0]
+    net = world.tables.modal[0, 0]
     heat_w, temp_c, modal = np.zeros(NODES), np.full(NODES, start_c), np.empty((6, NODES))
     heat_w[1] = 90.0 if start_c < 50.0 else 0.0
     temp_c[1] += 1.0
@@ -175,7 +175,7 @@ def test_a_returned_job_queues_at_the_end(small) -> None:
     state = initial(world)
     for tick in range(200):
         state = step(world, state, np.array([[int(tick == 0), 0]]), plant, log).state
-        order = [world.jobs.names[0][j] for j in open_jobs(world, state)[0][0].tolist() if j >= 0]
+        order = [world.shifts[0].names[j] for j in open_jobs(world, state)[0][0].tolist() if j >= 0]
         if state.returns[0, 0]:
             assert order[:4] == ["cool-0", "cool-1", "cool-2", "hot"]
     assert state.returns[0, 0] == 1

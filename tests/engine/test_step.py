@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from fleet.engine.shift import initial
-from fleet.engine.state import World
+from fleet.engine.world import World
 from fleet.events import Event
 from fleet.heat.motor import gen3_motors, thermal_data
 from fleet.heat.thermal import WINDING, gen3_network, thermal_model

@@ -1,7 +1,6 @@
 """Arms that a fault stops, and jobs that are given back or expire."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +9,7 @@ from fleet.engine.shift import initial, open_jobs, step
 from fleet.engine.state import DONE, EXPIRED, GIVEN_UP, WAITING
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, IDLE, WORKING
+from tests.shifts import with_conflicts
 
 DT_S = 10.0
 
@@ -21,7 +21,7 @@ def crossing(small, *, limits, ticks=400, repetitions=200):
     fleet = [small.arm(0, [hot]), small.arm(1, [light])]
     world, plant = small.shop([jobs], arms=fleet, limits=limits, ticks=ticks, slots=2)
     touching = np.ones((2, 2), bool) ^ np.eye(2, dtype=bool)
-    return replace(world, plans=replace(world.plans, volume=np.arange(2)), conflicts=touching), plant
+    return with_conflicts(world, touching), plant
 
 
 def until_the_fault(world, plant, log):

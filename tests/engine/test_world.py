@@ -42,9 +42,9 @@ def test_an_arm_offers_its_fastest_plan_whatever_the_scores(small) -> None:
     (offer,) = arm.offers(content)[3]
     assert offer[0] is fast
     world, _ = small.shop([[small.job("a")]], arms=[arm])
-    assert world.offers.difficulty[0, 0, 0, 0] == pytest.approx(1.0)
-    assert world.offers.p_saturation[0, 0, 0, 0] == 0.25
-    assert len(world.plans.times_s) == 1
+    assert world.tables.work["difficulty"][0, 0, 0, 0] == pytest.approx(1.0)
+    assert world.tables.work["p_saturation"][0, 0, 0, 0] == 0.25
+    assert len(world.tables.plans) == len(world.plans) == 1
 
 
 def test_without_a_score_it_offers_the_first_plan(small) -> None:
@@ -55,8 +55,8 @@ def test_without_a_score_it_offers_the_first_plan(small) -> None:
         (offer,) = arm.offers(small.work())[3]
         assert (offer[0].elbow, offer[1]) == (0, None)
         world, _ = small.shop([[small.job("a")]], arms=[arm])
-        assert np.isnan(world.offers.difficulty).all()
-        assert (world.offers.plan == 0).all()
+        assert np.isnan(world.tables.work["difficulty"]).all()
+        assert (world.tables.work["plan"] == 0).all()
 
 
 def test_each_number_of_repetitions_has_its_own_score(small) -> None:
@@ -69,42 +69,42 @@ def test_each_number_of_repetitions_has_its_own_score(small) -> None:
     content = small.work()
     jobs = [small.job("a", content, repetitions=5), small.job("b", content, repetitions=9)]
     world, _ = small.shop([jobs], arms=[small.arm(0, [content], model=ByLength())])
-    assert world.offers.difficulty[0, 0, :, 0] == pytest.approx([0.35, 0.63])
-    assert world.offers.plan[0, 0, :, 0].tolist() == [0, 0]
+    assert world.tables.work["difficulty"][0, :, 0, 0] == pytest.approx([0.35, 0.63])
+    assert world.tables.work["plan"][0, :, 0, 0].tolist() == [0, 0]
 
 
 def test_unplanned_work_is_not_offered(small) -> None:
     arm = small.arm(0, [small.work("rack")])
     assert arm.offers(small.work())[3] == []
     world, _ = small.shop([[small.job("a")]], arms=[arm])
-    assert world.offers.plan.tolist() == [[[[-1]]]]
+    assert world.tables.work["plan"].tolist() == [[[[-1]]]]
 
 
 def test_the_plan_table_holds_times_mean_heat_and_peaks(small) -> None:
     content = small.work(payload_kg=2.0)
     world, _ = small.shop([[small.job("a", content)]], arms=[small.arm(0, [content], qd=0.5)])
     tau = small.torque(2.0)
-    assert world.plans.times_s.tolist() == [[3.0, 10.0, 2.0]]
-    assert world.plans.peak_tau[0] == pytest.approx(tau)
+    assert world.tables.plans["times_s"].tolist() == [[3.0, 10.0, 2.0]]
+    assert world.fleet[0].driven(world.plans[0])[3] == pytest.approx(tau)
     motors = gen3_motors()
-    assert world.plans.current_sq[0, 0] == pytest.approx((tau / motors.eta / motors.torque_per_amp) ** 2)
-    assert (world.plans.friction_w[0, [0, 2]] == 0).all()
+    assert world.tables.plans["current_sq"][0, 0, :7] == pytest.approx((tau / motors.eta / motors.torque_per_amp) ** 2)
+    assert (world.tables.plans["friction_w"][0, [0, 2]] == 0).all()
     friction = motors.coulomb_nm * np.tanh(0.5 / motors.v0_rad_s) + motors.viscous_nms_per_rad * 0.5
-    assert world.plans.friction_w[0, 1] == pytest.approx(friction * 0.5)
+    assert world.tables.plans["friction_w"][0, 1, :7] == pytest.approx(friction * 0.5)
 
 
-def test_the_job_table_equals_the_jobs(small) -> None:
+def test_the_shifts_equal_the_jobs(small) -> None:
     first = small.job("first", small.work("bench", 2.0, to="rack"), release_s=5.0, due_s=9.0, value=7.0, repetitions=4)
     second = small.job("second", small.work("rack"), after=("first",))
     world, _ = small.shop([[first, second], [second.__class__(**{**vars(second), "after": ()})]])
-    table = world.jobs
+    shift, other = world.shifts
     assert world.stations == ("bench", "rack")
-    assert table.exists.tolist() == [[True, True], [True, False]]
-    assert table.stations.tolist() == [[[0, 1], [1, -1]], [[1, -1], [-1, -1]]]
-    assert table.after.tolist() == [[[-1], [0]], [[-1], [-1]]]
-    assert table.names == (("first", "second"), ("second",))
-    row = (table.release_s, table.due_s, table.value, table.payload_kg, table.repetitions)
-    assert [column[0, 0] for column in row] == [5.0, 9.0, 7.0, 2.0, 4]
+    assert world.tables.stations[0, :, 0].tolist() == [0b11, 0b10, 0b10, 0]
+    assert (shift.kind.tolist(), other.kind.tolist()) == ([0, 1], [2])
+    assert (shift.after.tolist(), other.after.tolist()) == ([[-1], [0]], [[-1]])
+    assert (shift.names, other.names) == (("first", "second"), ("second",))
+    assert [column[0] for column in (shift.release_s, shift.due_s, shift.repetitions)] == [5.0, 9.0, 4]
+    assert [column[0, 0] for column in (world.tables.value, world.tables.payload_kg)] == [7.0, 2.0]
 
 
 def test_cyclic_predecessors_and_an_arm_that_overheats_at_home_are_refused(small) -> None:
@@ -136,12 +136,11 @@ def test_offers_index_rows_of_the_risk_table(small) -> None:
     content = small.work()
     jobs = [small.job("a", content, repetitions=2), small.job("b", content, repetitions=3), small.job("c", content)]
     arms = [small.arm(0, [content], model=ByLength()), small.arm(1, [content])]
-    offers = small.shop([jobs, jobs[:1]], arms=arms)[0].offers
-    assert offers.risk[..., 0].tolist() == [[[0, 1, 1], [-1, -1, -1]], [[0, -1, -1], [-1, -1, -1]]]
-    assert offers.forecasts is not None
-    assert offers.forecasts.offset.tolist() == [[-2.0, -2.0, -np.inf], [-3.0] * 3]
-    assert np.isnan(offers.p_saturation[:, 0]).all()
-    assert small.shop([jobs], arms=[arms[1]])[0].offers.forecasts is None
+    tables = small.shop([jobs, jobs[:1]], arms=arms)[0].tables
+    assert tables.work["risk"][0, ..., 0].tolist() == [[0, -1], [1, -1], [1, -1], [0, -1]]  # [kind, arm]
+    assert tables.forecast_block[:, 0, :3].tolist() == [[-2.0, -2.0, -np.inf], [-3.0] * 3]
+    assert np.isnan(tables.work["p_saturation"][:, :, 0]).all()
+    assert len(small.shop([jobs], arms=[arms[1]])[0].tables.forecast_block) == 0
 
 
 def alternatives(small, count: int, stations: int = 3):
@@ -170,7 +169,7 @@ def test_arms_with_alternatives_never_share_a_station(small, seed) -> None:
     world, plant = small.shop([jobs], arms=arms, slots=6, plans_per_job=2)
     state, most = initial(world), 0
     station = {
-        world.offers.plan[0, a, 0, n]: plan.work.stations
+        world.tables.work["plan"][0, 0, a, n]: plan.work.stations
         for a, arm in enumerate(arms)
         for n, (plan, _) in enumerate(arm.offers(*jobs[0].works)[3])
     }

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from fleet.difficulty import KNOWN, Difficulty, Forecast
-from fleet.engine.state import DONE, WAITING, State, World
+from fleet.engine.state import DONE, WAITING, State
+from fleet.engine.world import World
 from fleet.env.allocation_v2 import AllocationEnv, parallel_env
 from fleet.env.vector import BatchEnv
 from fleet.observation import FIELDS, Observation
@@ -52,12 +53,12 @@ def chosen(mask: np.ndarray, numbers: np.ndarray) -> np.ndarray:
 
 def slots_of(world: World, state: State) -> list[int]:
     """Jobs in the slots of env 0 by the rule: released, waiting, nothing to wait for; oldest first; −1 for none."""
-    jobs, status = world.jobs, state.status[0]
+    shift, status = world.shifts[0], state.status[0]
     ready = [
         j
-        for j in np.flatnonzero(jobs.exists[0] & (status == WAITING)).tolist()
-        if jobs.release_s[0, j] <= state.tick[0] * world.dt_s
-        and all(status[before] == DONE for before in jobs.after[0, j].tolist() if before >= 0)
+        for j in np.flatnonzero(status[: len(shift.kind)] == WAITING).tolist()
+        if shift.release_s[j] <= state.tick[0] * world.dt_s
+        and all(status[before] == DONE for before in shift.after[j].tolist() if before >= 0)
     ]
     ready.sort(key=lambda j: (state.queued_s[0, j], j))
     return (ready + [-1] * world.slots)[: world.slots]

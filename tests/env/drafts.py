@@ -6,7 +6,7 @@ from typing import Any
 from hypothesis import strategies as st
 
 from fleet.engine.profile_plant import ProfilePlant
-from fleet.engine.state import World
+from fleet.engine.world import World
 from fleet.job import Job
 from fleet.robot import ThermalLimits
 

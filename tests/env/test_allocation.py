@@ -8,6 +8,7 @@ import pytest
 from fleet.bus.exchange.memory import Exchange
 from fleet.bus.exchange.zenoh import ZenohExchange
 from fleet.engine.batch import TERMS, RewardWeights
+from fleet.engine.tables import drive_of
 from fleet.env.allocation_v2 import AllocationEnv, Episode, parallel_env
 from fleet.env.vector import BatchEnv
 from fleet.robot import ThermalLimits
@@ -34,7 +35,7 @@ def test_an_episode_ends_when_all_jobs_are_done(make, small, play) -> None:
     assert set(trace[-1][2].values()) == {True}
     assert set(trace[-1][3].values()) == {False}
     assert trace[-1][4]["arm_0"]["jobs_done"] == 1.0
-    assert env.world.jobs.due_s[0, 0] < env.world.horizon_s
+    assert env.world.shifts[0].due_s[0] < env.world.horizon_s
 
 
 def test_jobs_done_in_the_last_step_terminate_and_do_not_truncate(make, play) -> None:
@@ -118,7 +119,10 @@ def test_an_idle_step_costs_only_its_energy(small) -> None:
         assert not terms[name].any()
     assert terms["energy"].sum() == pytest.approx(-0.5 * env.truth.energy_j.sum() / 3600.0)
     # Idle drives, and the current that holds the arm at home, near 25 °C.
-    watts = env.world.motors.idle_w.sum() + (env.world.motors.copper_w_per_a2 * env.world.rest.current_sq).sum()
+    watts = (
+        env.world.motors.idle_w.sum()
+        + (env.world.motors.copper_w_per_a2 * drive_of(env.world.tables.start[0])[0]).sum()
+    )
     assert terms["energy"].sum() == pytest.approx(-0.5 * watts * 60.0 / 3600.0, rel=1e-3)
 
 
@@ -137,7 +141,7 @@ def test_the_rewards_of_an_episode_add_up_to_the_event_log(small, seed) -> None:
         total += rewards["arm_0"]
         for name in TERMS:
             got[name] += infos["arm_0"][f"reward_{name}"]
-    value = dict(zip(env.world.jobs.names[0], env.world.jobs.value[0].tolist(), strict=True))
+    value = {job.name: job.value for job in env.world.kinds}
     finishes = [e for e in env.events if e.kind == "finish"]
     faults = [e for e in env.events if e.kind == "fault"]
     assert finishes
@@ -221,7 +225,7 @@ def test_a_step_ends_as_soon_as_an_arm_may_claim_a_job(small) -> None:
         ended = any((*over.values(), *cut.values()))
         may_claim = any(seen["action_mask"][1:-1].any() for seen in observations.values())
         at_work = env.truth.mode[0] == WORKING
-        warned = (env.truth.temp_c[0, :, :7].max(axis=1) >= env.world.limits.warning_c) & at_work
+        warned = (env.truth.temp_c[0, :, :7].max(axis=1) >= env.world.tables.warning_c) & at_work
         assert ended or may_claim or warned.any()
 
 

@@ -13,14 +13,15 @@ import pytest
 
 from fleet.bus.exchange.channel import Channel
 from fleet.bus.exchange.memory import Exchange
-from fleet.engine.state import DONE, JOB, State, World
+from fleet.engine.state import DONE, JOB, State
 from fleet.engine.tables import Tables
+from fleet.engine.world import World
 from fleet.env.allocation_v2 import Episode, parallel_env
 from fleet.env.vector import BatchEnv
 from fleet.heat.motor import gen3_motors
 from fleet.heat.thermal import WINDING
 from fleet.offered_plans import PLANS
-from fleet.robot import JOINTS, ThermalLimits
+from fleet.robot import ThermalLimits
 from scenarios.policy_loader import policy_of
 from scenarios.prepare.batch import library_of
 from scenarios.prepare.fleet import Fleet, env_of, prepare
@@ -276,10 +277,8 @@ def check_equal(actual: State, expected: State, jobs: int) -> None:
 def check_plans(tables: Tables, actual: np.ndarray, world: World, expected: np.ndarray) -> None:
     """Assert that arms away from home follow equal plans, int [arm]; each table has rows of its own."""
     one, other = actual[actual >= 0], expected[expected >= 0]
-    np.testing.assert_array_equal(tables.plans["times_s"][one], world.plans.times_s[other])
-    np.testing.assert_array_equal(
-        tables.plans["current_sq"][one, :, :JOINTS], world.plans.current_sq[other].astype(np.float32)
-    )
+    np.testing.assert_array_equal(tables.plans["times_s"][one], world.tables.plans["times_s"][other])
+    np.testing.assert_array_equal(tables.plans["current_sq"][one], world.tables.plans["current_sq"][other])
 
 
 def test_every_entry_point_repeats_a_recorded_run(fleet, recorded, play) -> None:
@@ -290,10 +289,10 @@ def test_every_entry_point_repeats_a_recorded_run(fleet, recorded, play) -> None
     single.reset(seed=SEED)
     obs, _ = batch.reset()
     rewards, arms, terms = np.zeros(3), logged.possible_agents, {}
-    jobs = len(logged.world.jobs.names[0])
+    jobs = len(logged.world.shifts[0].names)
     while logged.agents:
         slots = play.slots_of(logged.world, logged.truth)
-        names = [logged.world.jobs.names[0][j] if j >= 0 else "" for j in slots]
+        names = [logged.world.shifts[0].names[j] if j >= 0 else "" for j in slots]
         actions = actions_of(recorded, names, arms, float(logged.truth.tick[0] * logged.world.dt_s))
         check_equal(single.truth, logged.truth, jobs)
         np.testing.assert_array_equal(single.truth.plan, logged.truth.plan)
@@ -320,7 +319,7 @@ def test_every_entry_point_repeats_a_recorded_run(fleet, recorded, play) -> None
     np.testing.assert_allclose(rewards, recorded.reward, rtol=1e-9)
     finished = {e.job: e.time_s for e in recorded.events if e.kind == "finish"}
     truth, world = single.truth, single.world
-    actual = {n: truth.finished_s[0, j] for j, n in enumerate(world.jobs.names[0]) if truth.status[0, j] == DONE}
+    actual = {n: truth.finished_s[0, j] for j, n in enumerate(world.shifts[0].names) if truth.status[0, j] == DONE}
     assert actual == pytest.approx(finished, rel=1e-9)
     assert truth.faults.sum() == sum(e.kind == "fault" for e in recorded.events) == recorded.metrics.faults > 0
     assert dict(zip(arms, truth.peak_c[0].tolist(), strict=True)) == pytest.approx(recorded.metrics.peak_c, rel=1e-9)

@@ -13,8 +13,6 @@ from fleet.bus.exchange.channel import Channel
 from fleet.bus.exchange.memory import Exchange
 from fleet.difficulty import KNOWN, Difficulty, Forecast
 from fleet.engine.batch import Engine, RewardWeights, empty_parts
-from fleet.engine.shift import shifts_of
-from fleet.engine.tables import tables_of
 from fleet.engine.world import CYCLES_S
 from fleet.env.lookahead import CellSimulator
 from fleet.env.vector import BatchEnv, Library
@@ -55,8 +53,7 @@ def env_of(
         )
     jobs = [small.job(f"j{j}", (bench, rack)[j % 2], repetitions=2) for j in range(6)]
     world, _ = small.shop([jobs], arms=arms, ticks=60, slots=6)
-    tables, drawn = tables_of(world)
-    shift = shifts_of(drawn, [7])[0]
+    tables, shift = world.tables, replace(world.shifts[0], noise_key=7)
     names = tuple(f"arm_{i}" for i in range(3))
     exchanges = None if channel is None else [Exchange(names, channel)]
     return BatchEnv(
@@ -150,7 +147,7 @@ def test_a_planner_simulates_the_heat_that_arms_have_measured(small) -> None:
     known = env.layout.read_each(env.agents, obs["shared"][0], obs["own"][0], obs["action_mask"][0])
     believed, energy_wh = env_of(small, learns=False, copper=1.0), []
     weights = RewardWeights(finished_value=0.0, tardiness=0.0, above_warning=0.0, faults=0.0, energy=-1.0)
-    simulator = CellSimulator(believed._engine.tables, 3, 6, weights)
+    simulator = CellSimulator(believed.engine.tables, 3, 6, weights)
     rest_w = heat_w(small.torque(0.0) / 3.0)
     cell = env.lookahead(simulator, 0)
     for job, cycles_s in ((2, 120.0), (1, 120.0)):  # at the bench, where arm 0 has measured, and at the rack
@@ -194,8 +191,7 @@ def idle_env(small, *, true: ThermalModel, believed: ThermalModel, drift_k_per_s
         motors=replace(gen3_motors(), sensor_noise_k=np.zeros(JOINTS)),
     )
     world, _ = small.shop([[small.job("later", bench, release_s=10.0)]], arms=[arm], ticks=400, slots=1)
-    tables, drawn = tables_of(world)
-    shift = shifts_of(drawn, [7])[0]
+    tables, shift = world.tables, replace(world.shifts[0], noise_key=7)
     return BatchEnv(Library(("arm_0",), 1, tables, lambda _: shift), 1, seed=0, scaled=False, ahead_s=np.inf)
 
 
@@ -271,7 +267,7 @@ def test_an_idle_arm_finds_by_how_much_its_sensors_have_drifted(small, drift_k_p
     env.reset()
     for _ in range(200):
         env.step(np.zeros((1, 1), int))
-    assert least_k <= env._engine.measured(0, [0])[1][0] <= most_k
+    assert least_k <= env.engine.measured(0, [0])[1][0] <= most_k
 
 
 def test_compiled_and_plain_loops_agree_also_after_faults(small) -> None:
@@ -286,8 +282,7 @@ def test_compiled_and_plain_loops_agree_also_after_faults(small) -> None:
         arms.append(replace(own, executed=harder, learns=True, known=(fan, gen3_motors())))
     jobs = [small.job(f"j{j}", works[j % 4], repetitions=60, release_s=30.0 * j) for j in range(24)]
     world, _ = small.shop([jobs], arms=arms, ticks=400, slots=6, ambient_c=45.0)
-    tables, drawn = tables_of(world)
-    shift = shifts_of(drawn, [7])[0]
+    tables, shift = world.tables, replace(world.shifts[0], noise_key=7)
     layout, one = Layout(3, 6, plans=1), np.zeros(1, int)
     engines = [Engine(tables, 1, layout, RewardWeights(), jobs=24, compiled=compiled) for compiled in (True, False)]
     parts = [empty_parts(layout, 1) for _ in engines]

@@ -11,11 +11,12 @@ from scipy.special import expit
 
 from fleet.bus.exchange.channel import Channel, Partition
 from fleet.bus.exchange.memory import UNHEARD, Exchange, PeerView
-from fleet.engine.batch import Engine, Parts, RewardWeights, empty_parts, shifts_of
+from fleet.difficulty import Forecast
+from fleet.engine.batch import Engine, Parts, RewardWeights, empty_parts
 from fleet.engine.profile_plant import sensor_noise
-from fleet.engine.shift import Episode, ShiftRunner, broadcast, initial, step, write_members
-from fleet.engine.state import State, World
-from fleet.engine.tables import tables_of
+from fleet.engine.shift import Episode, broadcast, initial, step, write_members
+from fleet.engine.state import State
+from fleet.engine.world import World
 from fleet.env.allocation_v2 import parallel_env
 from fleet.errors import ScenarioError
 from fleet.heat.motor import gen3_motors
@@ -28,6 +29,7 @@ from scenarios.prepare.fleet import make_env
 from scenarios.spec.load import load
 from tests.env.drafts import drafts, world_of
 from tests.profiles import examples
+from tests.shifts import Single, with_conflicts, with_tables
 
 
 def test_fields_and_attributes_are_the_same_in_the_same_order() -> None:
@@ -124,57 +126,65 @@ def test_vectors_of_wrong_size_are_refused() -> None:
 
 def with_second_plans(world: World, rng: np.random.Generator) -> World:
     """Return the world in which arms have a second, slower plan for some jobs, with its own space and scores."""
-    table, offers, count = world.plans, world.offers, len(world.plans.volume)
-    twice = {name: np.concatenate([values, values]) for name, values in vars(table).items()}
-    twice["times_s"][count:] *= 1.5
-    twice["volume"][count:] += len(world.conflicts)
-    new = np.triu(rng.random((2 * len(world.conflicts),) * 2) < 0.2)
+    work, plans, count = world.tables.work, np.concatenate([world.tables.plans] * 2), len(world.tables.plans)
+    plans["times_s"][count:] *= 1.5
+    new = np.triu(rng.random((2 * count,) * 2) < 0.2)
     conflicts = np.tile(world.conflicts, (2, 2)) ^ (new | new.T)
-    for own in np.moveaxis(offers.plan, 1, 0):  # an arm's plans never exclude each other
-        volumes = twice["volume"][np.concatenate([own[own >= 0], own[own >= 0] + count])]
-        conflicts[np.ix_(volumes, volumes)] = False
-    second = (offers.plan >= 0) & (rng.random(offers.plan.shape) < 0.7)
-    scored = second & (rng.random(offers.plan.shape) < 0.7)
-    more = {
-        "plan": np.where(second, offers.plan + count, -1),
-        "difficulty": np.where(scored, rng.uniform(0.0, 2.0, offers.plan.shape), np.nan),
-        "p_saturation": np.where(scored, rng.random(offers.plan.shape), np.nan),
-        "risk": np.full(offers.plan.shape, -1),
-        "peak": np.full(offers.plan.shape, -1),
-    }
-    both = {name: np.concatenate([getattr(offers, name), values], axis=-1) for name, values in more.items()}
-    return replace(world, plans=replace(table, **twice), conflicts=conflicts, offers=replace(offers, **both))
+    for own in np.moveaxis(work["plan"], 2, 0):  # an arm's plans never exclude each other
+        rows = np.concatenate([own[own >= 0], own[own >= 0] + count])
+        conflicts[np.ix_(rows, rows)] = False
+    more = work.copy()
+    second = (work["plan"] >= 0) & (rng.random(work.shape) < 0.7)
+    scored = second & (rng.random(work.shape) < 0.7)
+    more["plan"] = np.where(second, work["plan"] + count, -1)
+    more["travel_s"], more["cycle_s"] = (np.where(second, 1.5 * work[name], 0.0) for name in ("travel_s", "cycle_s"))
+    more["difficulty"] = np.where(scored, rng.uniform(0.0, 2.0, work.shape), np.nan)
+    more["p_saturation"] = np.where(scored, rng.random(work.shape), np.nan)
+    more["risk"] = more["peak"] = -1
+    other = with_tables(world, plans=plans, work=np.concatenate([work, more], axis=-1))
+    return with_conflicts(replace(other, plans=world.plans * 2), conflicts)
 
 
-def value_of(world: World, row: int, known_c: np.ndarray, left_s: float = np.inf) -> float:
+def value_of(forecast: Forecast, known_c: np.ndarray, left_s: float = np.inf) -> float:
     """Value of a forecast by its definition."""
-    forecasts = world.offers.forecasts
-    assert forecasts is not None
-    counts = np.isfinite(forecasts.offset[row])
-    if forecasts.time_s is not None:
-        counts &= forecasts.time_s[row] <= left_s
-    return max((forecasts.offset[row] + forecasts.weight[row] @ known_c)[counts], default=-np.inf)
+    counts = np.isfinite(forecast.offset)
+    if forecast.time_s is not None:
+        counts &= forecast.time_s <= left_s
+    return max((forecast.offset + forecast.weight @ known_c)[counts], default=-np.inf)
 
 
 def prediction(world: World, at: tuple[int, ...], known_c: np.ndarray, left_s: float = np.inf) -> tuple[float, float]:
-    """P and the predicted peak of an option (env, arm, job, plan), 0.5 and 0 if unknown."""
-    p, risk, peak = (getattr(world.offers, name)[at] for name in ("p_saturation", "risk", "peak"))
-    if risk >= 0:
-        forecasts = world.offers.forecasts
-        assert forecasts is not None
-        curve = np.zeros((0, 2)) if forecasts.curve is None else forecasts.curve[risk]
-        curve = curve[np.isfinite(curve[:, 0])]
-        score = value_of(world, risk, known_c, left_s)
-        p = np.interp(score, *curve.T) if len(curve) else expit(score)
-    peak_c = value_of(world, peak, known_c, left_s) if peak >= 0 else 0.0
+    """P and the predicted peak of an option (arm, job, plan), 0.5 and 0 if unknown."""
+    work = option_of(world, at)
+    p, peak_c = float(work["p_saturation"]), 0.0
+    if work["risk"] >= 0 or work["peak"] >= 0:
+        a, j, n = at
+        job = world.kinds[j]
+        _, score = world.fleet[a].offers(*job.works)[job.repetitions][n]
+        assert score is not None
+        if score.risk is not None:
+            curve, value = score.risk.curve, value_of(score.risk, known_c, left_s)
+            p = expit(value) if curve is None else np.interp(value, *curve.T)
+        if score.peak is not None:
+            peak_c = value_of(score.peak, known_c, left_s)
     return 0.5 if np.isnan(p) else float(p), max(peak_c, -60.0)
+
+
+def option_of(world: World, at: tuple[int, ...]) -> np.ndarray:
+    """What an arm knows of its plans for a job of env 0, or of one plan, at (arm, job, ...)."""
+    arm, job, *plan = at
+    return world.tables.work[(0, job, arm, *plan)]
+
+
+def stations_of(world: World, j: int) -> set[str]:
+    return set(world.kinds[j].stations) if j >= 0 else set()
 
 
 def groups_of(world: World, slots: list[int]) -> list[int]:
     """Return the group of each slot: a job takes that of the first one before it with which it shares a station."""
     groups: list[int] = []
     for k, j in enumerate(slots):
-        taken = [set(world.jobs.stations[0, i].tolist()) - {-1} for i in slots[: k + 1]]
+        taken = [stations_of(world, i) for i in slots[: k + 1]]
         shared = [groups[i] for i in range(k) if taken[i] & taken[k]]
         groups.append(0 if j < 0 else shared[0] if shared else k + 1)
     return groups
@@ -182,14 +192,14 @@ def groups_of(world: World, slots: list[int]) -> list[int]:
 
 def blockers(world: World, state: State, a: int, plan: int) -> list[int]:
     """Return the arms away from home whose volumes exclude that of a plan of arm `a`."""
-    volume, away = world.plans.volume, state.plan[0].tolist()
+    away = state.plan[0].tolist()
     others = [b for b in range(len(away)) if b != a and away[b] >= 0]
-    return [b for b in others if world.conflicts[volume[plan], volume[away[b]]]]
+    return [b for b in others if world.conflicts[plan, away[b]]]
 
 
 def least_difficulty(world: World, a: int, j: int) -> float:
     """Return the least difficulty of an arm's plans for a job, -1 without any, 0 for an empty slot."""
-    known = [] if j < 0 else [d for d in world.offers.difficulty[0, a, j].tolist() if not np.isnan(d)]
+    known = [] if j < 0 else [d for d in option_of(world, (a, j))["difficulty"].tolist() if not np.isnan(d)]
     return 0.0 if j < 0 else min(known, default=-1.0)
 
 
@@ -205,7 +215,7 @@ def break_in_s(world: World, arm: int, now_s: float) -> float:
 
 
 def absences(world: World) -> list[tuple[int, int, int, int]]:
-    return world.absences.tolist()
+    return world.shifts[0].absences.tolist()
 
 
 def reference(world: World, state: State, slots: list[int], key: int, layout: Layout) -> dict[str, np.ndarray]:
@@ -213,15 +223,15 @@ def reference(world: World, state: State, slots: list[int], key: int, layout: La
 
     Besides the fields: whether a plan has `free` space, and whether an arm may `give_back` its job.
     """
-    arms, now_s, jobs, offers = len(world.arms), state.tick[0] * world.dt_s, world.jobs, world.offers
+    arms, now_s, shift, kinds = len(world.arms), state.tick[0] * world.dt_s, world.shifts[0], world.kinds
     measured_c = state.temp_c[0, :, :7] + world.motors.sensor_noise_k * sensor_noise(key, state.tick[0], arms, 7)
-    ambient_c = world.ambient_c[min(int(state.tick[0]), world.ticks - 1)]
-    times_s, away = world.plans.times_s, state.plan[0]
-    occupied = {s for j in state.job[0].tolist() if j >= 0 for s in jobs.stations[0, j].tolist() if s >= 0}
+    ambient_c = world.tables.ambient_c[0, min(int(state.tick[0]), world.ticks - 1)]
+    times_s, away = world.tables.plans["times_s"], state.plan[0]
+    occupied = set().union(*(stations_of(world, j) for j in state.job[0].tolist()))
     shared: dict[str, object] = {"left_s": world.horizon_s - now_s, "group": groups_of(world, slots)}
     each_slot = [
-        [not occupied & set(jobs.stations[0, j].tolist()), now_s - state.queued_s[0, j], jobs.due_s[0, j] - now_s,
-         jobs.payload_kg[0, j], jobs.value[0, j], state.returns[0, j], jobs.expires[0, j]] if j >= 0 else [0] * 7
+        [not occupied & stations_of(world, j), now_s - state.queued_s[0, j], shift.due_s[j] - now_s,
+         kinds[j].work.payload_kg, kinds[j].value, state.returns[0, j], shift.expires[j]] if j >= 0 else [0] * 7
         for j in slots
     ]  # fmt: skip
     names = ("station_free", "age_s", "due_in_s", "payload_kg", "value", "returns", "expires")
@@ -234,33 +244,33 @@ def reference(world: World, state: State, slots: list[int], key: int, layout: La
         mine: dict[str, object] = {
             "working": mode == WORKING, "faulted": mode == FAULTED, "break_in_s": break_in_s(world, a, now_s),
             "last_award": state.last_award[0, a], "temp_c": measured_c[a],
-            "busy_s": busy_s, "headroom_k": world.limits.warning_c - measured_c[a].max(),
-            "error_headroom_k": world.limits.error_c - measured_c[a].max(),
+            "busy_s": busy_s, "headroom_k": world.tables.warning_c - measured_c[a].max(),
+            "error_headroom_k": world.tables.error_c - measured_c[a].max(),
             "housing_c": state.housing_c[0, a], "ambient_c": ambient_c[a],
             "job_value": 0.0, "job_cycles": 0.0, "job_peak_c": 0.0, "job_p": 0.0, "give_back": 0.0,
         }  # fmt: skip
         into_s = state.progress_s[0, a] - times_s[away[a], 0]
         if mode == WORKING and state.job[0, a] >= 0 and into_s < todo * times_s[away[a], 1] - 1e-6:
             j = int(state.job[0, a])
-            n = offers.plan[0, a, j].tolist().index(away[a])
-            p, peak_c = prediction(world, (0, a, j, n), known_c, busy_s)
+            n = option_of(world, (a, j))["plan"].tolist().index(away[a])
+            p, peak_c = prediction(world, (a, j, n), known_c, busy_s)
             cycles = max(into_s, 0.0) / times_s[away[a], 1]
             mine |= {
-                "job_value": jobs.value[0, j], "job_p": p,
-                "job_peak_c": max(peak_c, measured_c[a].max()) if offers.peak[0, a, j, n] >= 0 else 0.0,
-                "job_cycles": jobs.repetitions[0, j] - state.cycles[0, j] - int(cycles + 1e-9),
+                "job_value": kinds[j].value, "job_p": p,
+                "job_peak_c": max(peak_c, measured_c[a].max()) if option_of(world, (a, j, n))["peak"] >= 0 else 0.0,
+                "job_cycles": shift.repetitions[j] - state.cycles[0, j] - int(cycles + 1e-9),
                 "give_back": np.ceil(cycles - 1e-9) < todo,
             }  # fmt: skip
         blocked, options = [], []
         for j in slots:
-            plans = offers.plan[0, a, j].tolist() if j >= 0 else [-1] * world.plans_per_job
+            plans = option_of(world, (a, j))["plan"].tolist() if j >= 0 else [-1] * world.plans_per_job
             blocked.append(plans[0] >= 0 and len(blockers(world, state, a, plans[0])) > 0)
             for n, plan in enumerate(plans):
                 if plan < 0:
                     options.append([0.0] * 5)
                     continue
-                duration_s = times_s[plan] @ [1, jobs.repetitions[0, j] - state.cycles[0, j], 1]
-                d, predicted = offers.difficulty[0, a, j, n], prediction(world, (0, a, j, n), known_c)
+                duration_s = times_s[plan] @ [1, shift.repetitions[j] - state.cycles[0, j], 1]
+                d, predicted = option_of(world, (a, j, n))["difficulty"], prediction(world, (a, j, n), known_c)
                 options.append(
                     [duration_s, np.nan_to_num(d, nan=-1.0), *predicted, not blockers(world, state, a, plan)]
                 )
@@ -308,13 +318,13 @@ def compare_with_reference(
         options: Of the layout.
     """
     world, rng = episode.world, np.random.default_rng(seed)
-    options |= {"plans": world.plans_per_job, "delivered": exchange is not None}
-    layout = Layout(len(world.arms), world.slots, **options)
-    runner, closed = ShiftRunner(episode, RewardWeights(), exchange=exchange, layout=layout), 0
+    runner, closed = Single(episode, exchange=exchange, **options), 0
+    options = {"scaled": False, "ahead_s": np.inf, "delivered": exchange is not None, **options}
+    layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job, **options)
     assert runner.layout == layout
     while True:
         slots = play.slots_of(world, runner.state)
-        assert runner.slot_job.tolist() == slots
+        assert runner.engine.offers.slot_job[0].tolist() == slots
         actual = layout.read_parts(*runner.parts, runner.mask)
         expected = reference(world, runner.state, slots, episode.noise_key, layout)
         assert set(expected) - {"give_back", "free"} == {field.name for field in FIELDS}
@@ -325,7 +335,7 @@ def compare_with_reference(
         np.testing.assert_array_equal(runner.mask, reference_mask(world, runner.state, slots, expected))
         closed += int(((expected["duration_s"] > 0) > expected["free"]).sum())
         if runner.tick == world.ticks:
-            return runner.state.copy(), closed
+            return runner.state, closed
         runner.step(play.chosen(runner.mask, rng.random((len(world.arms), 2))))
 
 
@@ -393,10 +403,8 @@ def test_options_of_arms_that_are_home_later_are_zero_and_others_unchanged(small
         np.random.default_rng(2),
     )
     world, ahead_s = episode.world, 11.5
-    layout = Layout(3, world.slots)
-    whole, some = (
-        ShiftRunner(episode, RewardWeights(), layout=replace(layout, ahead_s=each)) for each in (np.inf, ahead_s)
-    )
+    whole, some = (Single(episode, ahead_s=each) for each in (np.inf, ahead_s))
+    layout = whole.layout
     hidden = shown = 0
     while whole.tick < world.ticks:
         one, other = (layout.read_parts(*runner.parts, runner.mask) for runner in (whole, some))
@@ -419,10 +427,7 @@ def test_scaled_values_times_their_scales_are_the_values(small, play, near) -> N
     jobs = [small.job(f"j{i}", content[i % 4], release_s=50.0 * (i % 3)) for i in range(6)]
     world, plant = small.shop([jobs], arms=arms, ticks=50, space=small.crowded(0.3))
     episode, rng = Episode(world, plant, ("t",) * 3, np.random.SeedSequence(1)), np.random.default_rng(1)
-    plain, scaled = (
-        ShiftRunner(episode, RewardWeights(), layout=Layout(3, world.slots, near, scaled=each))
-        for each in (False, True)
-    )
+    plain, scaled = (Single(episode, near=near, scaled=each) for each in (False, True))
     layout = scaled.layout
     for _ in range(world.ticks):
         vectors = layout.join(*scaled.parts)
@@ -465,11 +470,11 @@ def engine_at(world: World, state: State, **options) -> tuple[Engine, Parts]:
     Args:
         options: Of the layout.
     """
-    tables, drawn = tables_of(world)
+    envs = len(world.shifts)
     layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job, **options)
-    engine = Engine(tables, world.envs, layout, RewardWeights(), jobs=state.status.shape[1], compiled=False)
-    rows, parts = np.arange(world.envs), empty_parts(layout, world.envs)
-    engine.reset(rows, shifts_of(drawn, [0] * world.envs))
+    engine = Engine(world.tables, envs, layout, RewardWeights(), jobs=state.status.shape[1], compiled=False)
+    rows, parts = np.arange(envs), empty_parts(layout, envs)
+    engine.reset(rows, world.shifts)
     engine.load(state)
     engine.observe(rows, parts)
     return engine, parts
@@ -629,14 +634,14 @@ def test_an_arm_broadcasts_what_it_measures_and_its_scores(small) -> None:
     measured = np.arange(14.0).reshape(1, 2, 7) + 40.0
     state.temp_c[..., :7] = measured
     engine, parts = engine_at(world, state, scaled=True, delivered=True)
-    message = broadcast(engine, parts, world.jobs.names[0], ("x", "y"))
+    message = broadcast(engine, parts, world.shifts[0].names, ("x", "y"))
     assert message.time_s == 0.0
     assert message.twin == ("x", "y")
     assert message.jobs == ("a", "", "")
     assert message.headroom_k.tolist() == [60.0 - 46.0, 60.0 - 53.0]
     assert message.temp_c.tolist() == measured[0].tolist()
-    assert message.difficulty[:, 0] == pytest.approx(world.offers.difficulty[0, :, 0, 0])
-    assert message.p_saturation[:, 0] == pytest.approx(world.offers.p_saturation[0, :, 0])
+    assert message.difficulty[:, 0] == pytest.approx(world.tables.work["difficulty"][0, 0, :, 0])
+    assert message.p_saturation[:, 0] == pytest.approx(world.tables.work["p_saturation"][0, 0])
     assert np.isnan(message.difficulty[:, 1:]).all()
     assert np.isnan(message.p_saturation[:, 1:]).all()
 

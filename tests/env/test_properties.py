@@ -39,13 +39,13 @@ def test_invariants_of_a_shift(small, play, draft) -> None:
         assert np.isfinite(list(rewards.values())).all()
         value += infos["arm_0"]["reward_finished_value"]
         before = now
-    jobs = env.world.jobs
-    status = before.status[0][jobs.exists[0]]
+    shift = env.world.shifts[0]
+    status = before.status[0, : len(shift.kind)]
     done, given_up = status == DONE, status > DONE
     assert terminated["arm_0"] == (len(done) > 0 and bool((done | given_up).all()))
     assert truncated["arm_0"] == (not terminated["arm_0"])
     assert infos["arm_0"]["jobs_done"] == done.sum()
-    assert value == np.float64(jobs.value[0][jobs.exists[0]][done].sum())
+    assert value == np.float64(env.world.tables.value[0, shift.kind][done].sum())
     check_events(env, before)
     event(
         f"faults: {min(int(before.faults.sum()), 2)}, done: {'all' if done.all() else 'some' if done.any() else 'none'}"
@@ -75,50 +75,50 @@ def test_arms_of_a_crowded_cell_do_not_touch(small, play, seed) -> None:
 
 def check_state(env: AllocationEnv, now: State) -> None:
     """Check the invariants of one state."""
-    world, jobs, exists = env.world, env.world.jobs, env.world.jobs.exists[0]
+    world, shift = env.world, env.world.shifts[0]
+    exists = np.arange(now.status.shape[1]) < len(shift.kind)
     mode, job, status = now.mode[0], now.job[0], now.status[0]
     elapsed_s = now.tick[0] * world.dt_s
     assert np.isfinite(now.temp_c).all()
-    assert (now.temp_c > world.ambient_c.min() - 1e-6).all()
+    assert (now.temp_c > world.tables.ambient_c.min() - 1e-6).all()
     # No two arms have one job or one station, and no arm has a job that waits.
     current = job[job >= 0]
     assert len(set(current.tolist())) == len(current)
     assert (job[mode != WORKING] == -1).all()
     # But for one that it gave back, on its way home.
-    times_s = world.plans.times_s[now.plan[0]]
+    times_s = world.tables.plans["times_s"][now.plan[0]]
     over = now.progress_s[0] >= times_s[:, 0] + now.todo[0] * times_s[:, 1] - 1e-6
     assert over[(job >= 0) & (status[job] == WAITING)].all()
     assert set(np.flatnonzero(status == RUNNING).tolist()) <= set(current.tolist())
-    places = [s for j in current.tolist() for s in set(jobs.stations[0, j].tolist()) if s >= 0]
+    places = [name for j in current.tolist() for name in world.kinds[shift.kind[j]].stations]
     assert len(set(places)) == len(places)
     # Arms at home take no space; of two arms that are away, neither takes space that the other needs.
     away = now.plan[0][now.plan[0] >= 0]
     assert (mode[now.plan[0] < 0] != WORKING).all()
     assert (mode[now.plan[0] >= 0] != IDLE).all()
-    volume = world.plans.volume[away]
-    assert not world.conflicts[np.ix_(volume, volume)].any()
+    assert not world.conflicts[np.ix_(away, away)].any()
     # A job is given up at its last fault, at the second one of an arm, or with a job that it waits for.
     for j in np.flatnonzero(exists).tolist():
         arms = now.failed_arm[0, j][now.failed_arm[0, j] >= 0].tolist()
         last = now.returns[0, j] - len(arms)  # the fault that gives it up adds no arm
         assert len(set(arms)) == len(arms) < MOST_FAULTS
         assert last in (0, 1)
-        lost = any(status[k] > DONE for k in jobs.after[0, j].tolist() if k >= 0)
+        lost = any(status[k] > DONE for k in shift.after[j].tolist() if k >= 0)
         expired = status[j] == EXPIRED
-        assert expired <= (jobs.expires[0, j] and jobs.due_s[0, j] < elapsed_s)
+        assert expired <= (shift.expires[j] and shift.due_s[j] < elapsed_s)
         assert (status[j] > DONE) == (lost or last == 1 or expired)
     # Cycles and completions.
-    cycles, repetitions = now.cycles[0][exists], jobs.repetitions[0][exists]
+    cycles, repetitions = now.cycles[0][exists], shift.repetitions
     done = status[exists] == DONE
     assert (cycles >= 0).all()
     assert (cycles <= repetitions).all()
     assert (cycles[done] == repetitions[done]).all()
     finished_s = now.finished_s[0][exists]
     assert (np.isnan(finished_s) == ~done).all()
-    assert (finished_s[done] >= jobs.release_s[0][exists][done]).all()
+    assert (finished_s[done] >= shift.release_s[done]).all()
     assert (finished_s[done] <= elapsed_s + 1e-9).all()
     for j in np.flatnonzero(exists & np.isin(status, (RUNNING, DONE))).tolist():
-        for first in jobs.after[0, j][jobs.after[0, j] >= 0].tolist():
+        for first in shift.after[j][shift.after[j] >= 0].tolist():
             assert status[first] == DONE
             assert not now.finished_s[0, j] < now.finished_s[0, first]
     # Time and heat are accounted for.
@@ -126,9 +126,8 @@ def check_state(env: AllocationEnv, now: State) -> None:
     assert (now.above_warning_s <= elapsed_s + 1e-6).all()
     assert (now.lost_s[now.faults == 0] == 0).all()
     assert (now.peak_c[0] >= now.temp_c[0, :, :7].max(axis=1) - 1e-9).all()
-    assert (
-        now.peak_c <= max(world.limits.error_c, float(world.start_c[:, :7].max()), world.ambient_c.max()) + 1e-6
-    ).all()
+    first_c = float(world.tables.modal["start_c"][..., :7].max())
+    assert (now.peak_c <= max(world.tables.error_c, first_c, world.tables.ambient_c.max()) + 1e-6).all()
     assert now.returns.sum() <= now.faults.sum()
     assert (now.faults[0][mode == FAULTED] > 0).all()
 
@@ -186,6 +185,6 @@ def test_the_state_has_as_many_jobs_as_the_world(small) -> None:
     draft = Draft((("bench", None, 0.0),), (frozenset({0}),), many, 3, 75.0, 25.0, False, False, 0.0, 900.0, 0)
     env = env_of(small, draft, render_mode="ansi")
     env.reset(seed=0)
-    assert env.truth.status.shape == env.world.jobs.exists.shape == (1, 12)
+    assert env.truth.status.shape == (1, env.world.jobs) == (1, 12)
     env.step({"arm_0": 1})
     assert "working" in str(env.render())

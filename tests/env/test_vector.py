@@ -15,14 +15,14 @@ from hypothesis import strategies as st
 
 from fleet.bus.exchange.channel import Channel
 from fleet.bus.exchange.memory import Exchange
-from fleet.engine.batch import BLOCK, shifts_of
-from fleet.engine.tables import stack_tables, tables_of
+from fleet.engine.batch import BLOCK
+from fleet.engine.tables import stack_tables
 from fleet.engine.world import Space
 from fleet.env.vector import BatchEnv, Library, Shelf
 from fleet.motion import Plan
 from scenarios.evaluate.rollout import outcomes
 from scenarios.prepare.batch import library_of, make_batch
-from scenarios.prepare.fleet import Fleet, Randomisation, make_env, prepare
+from scenarios.prepare.fleet import Fleet, Randomisation, env_of, make_env, prepare, simulator_of_shift
 from scenarios.run.shift import run
 from scenarios.spec.jobs import draw_jobs
 from scenarios.spec.options import RunSpec
@@ -472,6 +472,23 @@ def test_rows_of_two_variants_equal_batches_of_each(cell, plans, play) -> None:
     assert 0 < fleet.sum() < 12
 
 
+def test_the_single_env_and_its_simulator_are_those_of_the_variant_of_a_seed(cell, plans) -> None:
+    """And a reset of the same fleet draws a shift only: the tables stay."""
+    spread = {"spread": {"scale": 2.0, "seed": 9}}
+    fleet = prepare(cell, difficulty="oracle", cache=plans, randomise=Randomisation(variants=[spread]))
+    env, capacity, tables = env_of(fleet), [], set()
+    for seed in range(8):
+        variant = fleet.conditions(np.random.SeedSequence(seed)).fleet
+        env.reset(seed=seed)
+        expected = [arm.thermal.capacity for arm in fleet.all[variant].arms]
+        np.testing.assert_array_equal(env.world.thermal.capacity, expected)
+        simulated = simulator_of_shift(fleet, seed)._engine.tables.modal["root_capacity"][0]
+        np.testing.assert_allclose(simulated**2, expected)
+        capacity.append(float(expected[0][0]))
+        tables.add(id(env.batch.engine.tables))
+    assert len(set(capacity)) == len(tables) == 2
+
+
 def sparse(space: Space) -> Space:
     """Return a space with the same conflicts and 20 times as many volumes."""
 
@@ -499,9 +516,8 @@ def test_variants_with_different_risk_models_do_not_mix(small, play) -> None:
         jobs = [small.job(f"j{j}", content[j % 3], release_s=30.0 * (j // 2), repetitions=2 + j % 2) for j in range(9)]
         space = (None, small.crowded(0.4), sparse(small.crowded(0.4)))[fleet]
         world, _ = small.shop([jobs], arms=arms, ticks=40, ambient_c=30.0 + fleet, space=space)
-        own_tables, drawn = tables_of(world)
-        tables.append(own_tables)
-        shifts += shifts_of(drawn, [77])
+        tables.append(world.tables)
+        shifts.append(replace(world.shifts[0], noise_key=77))
     assert len({(*table.forecast_block.shape, *table.forecast_curve.shape) for table in tables}) == 3
     assert [table.excluded.shape[1] for table in tables] == [1, 1, 3]
     assert [bool(table.excluded.any()) for table in tables] == [False, True, True]

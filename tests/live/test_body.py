@@ -8,8 +8,6 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from fleet.engine.batch import Engine, RewardWeights, empty_parts
-from fleet.engine.shift import shifts_of
-from fleet.engine.tables import tables_of
 from fleet.env.allocation_v2 import Episode, parallel_env
 from fleet.heat.thermal import WINDING, modal_model
 from fleet.live.arm.body import MAX_STEPS, ExpectedTemperatures, SimulatedBody
@@ -67,7 +65,7 @@ def test_a_body_passes_the_same_shift_as_the_simulator(small, data):
     )
     world, plant = small.shop([jobs], arms=[arm], limits=limits, dt_s=DT_S, ticks=200, slots=8)
     air = 25.0 + 3.0 * np.sin(np.arange(200) / 30.0)[:, None]
-    world = replace(world, ambient_c=air)
+    world.tables.ambient_c[:] = air
     shift = parallel_env(
         lambda seed: Episode(world=world, plant=plant, twins=("t",), sensors=np.random.SeedSequence(0)),
         keep_events=True,
@@ -101,7 +99,7 @@ def test_a_body_passes_the_same_shift_as_the_simulator(small, data):
     expected = sorted((e.kind, e.job, round(e.time_s, 6)) for e in shift.events if e.kind in told)
     assert sorted((e.kind, e.job, round(e.time_s, 6)) for e in lived if e.kind in told) == expected
     assert {n: c for n, c in done.items() if n in waiting} == {
-        n: int(shift.truth.cycles[0, j]) for j, n in enumerate(world.jobs.names[0]) if n in waiting
+        n: int(shift.truth.cycles[0, j]) for j, n in enumerate(world.shifts[0].names) if n in waiting
     }
 
 
@@ -381,9 +379,8 @@ def test_a_body_compares_its_temperatures_as_the_arms_of_a_simulated_shift_do(sm
     arm = replace(arm, thermal=worse, motors=hotter, learns=True, known=(arm.thermal, arm.motors))
     job = small.job("a", content, repetitions=40)
     world, _ = small.shop([[job]], arms=[arm], dt_s=DT_S, ticks=150, slots=1)
-    tables, drawn = tables_of(world)
-    engine = Engine(tables, 1, Layout(1, 1), RewardWeights())
-    engine.reset(np.arange(1), shifts_of(drawn, [7]))
+    engine = Engine(world.tables, 1, Layout(1, 1), RewardWeights())
+    engine.reset(np.arange(1), world.shifts)
     parts = empty_parts(engine.layout, 1)
     engine.observe(np.arange(1), parts)
     body = body_of(arm)

@@ -120,7 +120,7 @@ class LiveShift:
 
     def node(self, arm, world) -> ArmNode:
         name = arm.robot.name
-        limits, places = world.limits, {w.places[0].name: w.places[0] for w in arm.plans}
+        limits, places = self.fleet.limits, {w.places[0].name: w.places[0] for w in arm.plans}
 
         def plan(work):
             if work not in arm.plans:
@@ -290,7 +290,7 @@ def test_a_live_policy_observes_what_it_observes_in_simulation(small, error_c, c
             "plans_per_job": 2,
         }
         world, plant = small.shop([jobs], space=space, **shop)
-        world = replace(world, ambient_c=np.array([[ambient_c(tick * world.dt_s)] * 3 for tick in range(world.ticks)]))
+        world.tables.ambient_c[0] = [[ambient_c(tick * world.dt_s)] * 3 for tick in range(world.ticks)]
         return Episode(world=world, plant=plant, twins=("scores",) * len(arms), sensors=seed)
 
     env = parallel_env(episode, ahead_s=np.inf, bids=True)

@@ -125,7 +125,7 @@ def test_the_same_observation_gives_the_same_choice_simulated_and_live(small, na
         open_slots = [slot for slot in range(len(seen["arm_0"].offered)) if seen["arm_0"].offered[slot]]
         if any(o.action_mask[1:-1].any() for o in seen.values()):
             time_s = float(env.truth.tick[0] * env.world.dt_s)
-            fleet = LiveFleet(arms=tuple(seen), limits=env.world.limits, horizon_s=env.world.horizon_s)
+            fleet = LiveFleet(arms=tuple(seen), limits=small.Shifts().limits, horizon_s=env.world.horizon_s)
             live_seen = observe(quoted(seen, time_s), fleet)
             for arm, o in seen.items():
                 # A quote does not contain busy stations, and no job is given back.

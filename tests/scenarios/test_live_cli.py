@@ -300,9 +300,9 @@ def test_the_stream_is_the_one_of_a_run(small_toml, plans):
     env = make_env(scenario, difficulty="blind", cache=plans)
     for seed in (0, 3):
         env.reset(seed=seed)
-        table, drawn = env.world.jobs, scenario_jobs(scenario, seed)
-        assert {word.name for _, word in drawn} == set(table.names[0])
-        for name, release_s, repetitions in zip(table.names[0], table.release_s[0], table.repetitions[0], strict=True):
+        shift, drawn = env.world.shifts[0], scenario_jobs(scenario, seed)
+        assert {word.name for _, word in drawn} == set(shift.names)
+        for name, release_s, repetitions in zip(shift.names, shift.release_s, shift.repetitions, strict=True):
             (word,) = (word for _, word in drawn if word.name == name)
             assert (word.release_s, word.repetitions) == (release_s, repetitions)
 

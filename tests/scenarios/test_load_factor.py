@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fleet.engine.tables import drive_of
 from fleet.heat.thermal import WINDING, drive_heat, gen3_network, thermal_model
 from scenarios.prepare.load_factor import LoadFactor, load_factor
 
@@ -34,17 +35,17 @@ def test_the_thermal_load_is_the_share_of_time_at_which_the_cycle_settles_at_the
     content = small.work(payload_kg=small.HOT)
     world, _ = small.shop([[small.job("a", content)]], arms=equal_arms(small, 1, content), ticks=TICKS)
     share = load_factor(world).thermal * HORIZON_S / ONE_JOB_S
-    limit_c = np.full(world.start_c.shape, 60.0)
-    row = world.offers.plan[0, 0, 0]
+    limit_c = np.full((1, 14), 60.0)
+    row = world.tables.work["plan"][0, 0, 0]
     working, standing = (
         drive_heat(limit_c, current_sq, friction_w, world.motors)
         for current_sq, friction_w in (
-            (world.plans.current_sq[row, 1], world.plans.friction_w[row, 1]),
-            (world.rest.current_sq, world.rest.friction_w),
+            (each[:, 1] for each in drive_of(world.tables.plans[row])),
+            drive_of(world.tables.start[0]),
         )
     )
     mixed = working / share + (1 - 1 / share) * standing
-    settled = world.thermal.steady(mixed, world.ambient_c.mean(axis=0))[..., WINDING]
+    settled = world.thermal.steady(mixed, world.tables.ambient_c[0].mean(axis=0))[..., WINDING]
     assert settled.max() == pytest.approx(60.0, abs=1e-6)
     assert share > 1.0  # it cannot go on for ever, as its name says
 

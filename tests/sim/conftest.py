@@ -56,7 +56,7 @@ def shift(*jobs, ticks=6, dt_s=10.0, limits=None, robots=ROBOTS, shifts=1):
         )
         for robot in robots
     ]
-    world, plans = build_world(
+    world = build_world(
         arms,
         [jobs] * shifts,
         limits=limits or ThermalLimits(),
@@ -66,6 +66,7 @@ def shift(*jobs, ticks=6, dt_s=10.0, limits=None, robots=ROBOTS, shifts=1):
         ambient_c=np.full((ticks, len(arms)), 25.0),
         start_warm=False,
     )
+    plans = world.plans
     rest_tau = np.stack([arm.rest_tau for arm in arms])
     home = np.stack([robot.home_q() for robot in robots])
     simulated = MujocoPlant(robots, plans, rest_tau)

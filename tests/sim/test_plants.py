@@ -17,6 +17,7 @@ from fleet.arm.plant import STRIDE, TIMESTEP_S, MujocoPlant, control, load_hands
 from fleet.arrivals import Arrivals
 from fleet.engine.profile_plant import sample, sample_row
 from fleet.engine.shift import initial, step
+from fleet.engine.tables import drive_of
 from fleet.errors import FleetError
 from fleet.heat.motor import gen3_motors
 from fleet.job import KINDS, Fixture, Place, Work, payload_radius_m
@@ -439,9 +440,9 @@ def test_heat_of_a_job_adds_up_to_that_of_its_motion(cell, kind):
         magnets = 1 + motors.alpha_kt_per_k * (housing_c - motors.reference_c)
         current_sq += done.record.heat_w[0, 0, :7] / copper * magnets**2 * world.dt_s
         friction_w += (done.record.heat_w[0, 0, 7:] - motors.idle_w) * world.dt_s
-    expected = (amps**2).sum(axis=0) / RATE_HZ + rest_s * world.rest.current_sq[0]
+    expected = (amps**2).sum(axis=0) / RATE_HZ + rest_s * drive_of(world.tables.start[0])[0][0]
     np.testing.assert_allclose(current_sq, expected, rtol=1e-6)
-    expected = (friction * whole[:, 1]).sum(axis=0) / RATE_HZ + rest_s * world.rest.friction_w[0]
+    expected = (friction * whole[:, 1]).sum(axis=0) / RATE_HZ + rest_s * drive_of(world.tables.start[0])[1][0]
     heat_w = max(float(done.record.heat_w[0, 0, 7:].max()) for done in steps)
     rounding_j = 0.5 * world.horizon_s * float(np.spacing(np.float32(heat_w)))  # the engine has heat in float32
     np.testing.assert_allclose(friction_w, expected, rtol=1e-6, atol=rounding_j)

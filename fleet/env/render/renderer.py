@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fleet.engine.state import State, World
+from fleet.engine.state import State
+from fleet.engine.world import World
 from fleet.env.render.scene import CellMap, scene_of
 from fleet.errors import FleetError, install
 

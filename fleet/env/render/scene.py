@@ -7,7 +7,8 @@ from typing import Literal
 import numpy as np
 
 from fleet.engine.shift import open_jobs
-from fleet.engine.state import DONE, WAITING, State, World
+from fleet.engine.state import DONE, WAITING, State
+from fleet.engine.world import World
 from fleet.heat.thermal import WINDING
 from fleet.job import Fixture
 from fleet.robot import Mount
@@ -117,8 +118,10 @@ def scene_of(world: World, state: State, cell: CellMap | None = None) -> Scene:
     if cell.arms != world.arms:
         raise ValueError(f"The cell has the arms {', '.join(cell.arms)}; the world has {', '.join(world.arms)}.")
     slot_job, mask = open_jobs(world, state)
-    jobs, mode = world.jobs, state.mode[0]
+    shift, mode = world.shifts[0], state.mode[0]
+    kinds = [world.kinds[kind] for kind in shift.kind.tolist()]
     time_s = float(state.tick[0] * world.dt_s)
+    status, released = state.status[0, : len(kinds)], shift.release_s <= time_s
     current = np.where(mode == WORKING, state.job[0], -1).tolist()
     on_offer, options = slot_job[0].tolist(), world.plans_per_job
     return Scene(
@@ -126,25 +129,25 @@ def scene_of(world: World, state: State, cell: CellMap | None = None) -> Scene:
         time_s=time_s,
         horizon_s=world.horizon_s,
         temp_c=state.temp_c[0, :, WINDING].copy(),
-        warning_c=world.limits.warning_c,
-        error_c=world.limits.error_c,
+        warning_c=world.tables.warning_c,
+        error_c=world.tables.error_c,
         mode=tuple(mode.tolist()),
-        job=tuple(jobs.names[0][j] if j >= 0 else "" for j in current),
+        job=tuple(shift.names[j] if j >= 0 else "" for j in current),
         progress=tuple(_progress(world, state, a, j) for a, j in enumerate(current)),
-        at=tuple(tuple(world.stations[s] for s in jobs.stations[0, j].tolist() if s >= 0 and j >= 0) for j in current),
+        at=tuple(kinds[j].stations if j >= 0 else () for j in current),
         queue=tuple(
             QueuedJob(
-                job=jobs.names[0][j],
-                payload_kg=float(jobs.payload_kg[0, j]),
-                due_in_s=float(jobs.due_s[0, j]) - time_s,
-                able=tuple(np.any(world.offers.plan[0, :, j] >= 0, axis=-1).tolist()),
+                job=shift.names[j],
+                payload_kg=kinds[j].work.payload_kg,
+                due_in_s=float(shift.due_s[j]) - time_s,
+                able=tuple(np.any(world.tables.work["plan"][0, shift.kind[j]] >= 0, axis=-1).tolist()),
                 free=tuple(np.any(mask[0, :, 1 + slot * options :][:, :options], axis=-1).tolist()),
             )
             for slot, j in enumerate(on_offer)
             if j >= 0
         ),
-        waiting=int((jobs.exists[0] & (state.status[0] == WAITING) & (jobs.release_s[0] <= time_s)).sum()),
-        finished=int((jobs.exists[0] & (state.status[0] == DONE)).sum()),
+        waiting=int(((status == WAITING) & released).sum()),
+        finished=int((status == DONE).sum()),
         faults=int(state.faults[0].sum()),
     )
 
@@ -153,6 +156,6 @@ def _progress(world: World, state: State, arm: int, job: int) -> float:
     """Finished share of the job of an arm; 0 for no job, -1."""
     if job < 0:
         return 0.0
-    approach, cycle, retreat = world.plans.times_s[state.plan[0, arm]].tolist()
+    approach, cycle, retreat = world.tables.plans["times_s"][state.plan[0, arm]].tolist()
     whole_s = approach + int(state.todo[0, arm]) * cycle + retreat
     return min(1.0, float(state.progress_s[0, arm]) / whole_s) if whole_s > 0 else 0.0

@@ -22,15 +22,15 @@ from fleet.difficulty import Blind
 from fleet.engine.corrections import compare, line_of
 from fleet.engine.profile_plant import ProfilePlant, telemetry_of
 from fleet.engine.shift import StepRecord, initial, step
-from fleet.engine.state import DONE, State, World
+from fleet.engine.state import DONE, State
 from fleet.engine.step import ROUNDING_S
-from fleet.engine.world import Arm, build_world
+from fleet.engine.world import Arm, World, build_world, law_of
 from fleet.events import Event
 from fleet.heat.motor import current
-from fleet.heat.thermal import HOUSING, WINDING, HousingObserver, ThermalModel, housing_observer
+from fleet.heat.thermal import HOUSING, WINDING, ThermalModel
 from fleet.job import Job
 from fleet.motion import Plan
-from fleet.robot import ThermalLimits
+from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Mode
 
 Array = np.ndarray
@@ -365,7 +365,8 @@ class SimulatedBody:
         if not (dt_s > 0 and max_dt_s > 0):
             raise ValueError(f"SimulatedBody.dt_s and max_dt_s must be > 0 (got {dt_s}, {max_dt_s}).")
         self._arm, self._limits, self._ambient_c, self._rng = arm, limits, ambient_c, rng
-        self._dt_s, self._max_dt_s = min(dt_s, max_dt_s), max_dt_s
+        self._dt_s: float = min(dt_s, max_dt_s)
+        self._max_dt_s = max_dt_s
         self._start_s = time_s
         self._task: _Current | None = None
         self._plan: Plan | None = None
@@ -494,12 +495,11 @@ class SimulatedBody:
             raise ValueError(f"The step of a body must be > 0 s (got {dt_s}).")
         time_s, before_s, dt_s = self.time_s, float(self._state.tick[0]) * self._dt_s, min(dt_s, self._max_dt_s)
         ticks = int(before_s / dt_s + ROUNDING_S)
-        phi, gamma = self._world.thermal.step_matrices(dt_s)
         # The engine counts its time in ticks of the new length, of which as many have passed.
         later_s = ticks * dt_s - before_s
         clear_at_s, moved_at_s = self._state.clear_at_s + later_s, self._state.moved_at_s + later_s
-        observer = HousingObserver(*(part[None] for part in housing_observer(*self._arm.beliefs, dt_s)))
-        self._world = replace(self._world, dt_s=dt_s, phi=phi, gamma=gamma, observer=observer)
+        tables = self._world.tables._replace(dt_s=dt_s, law=law_of(self._arm, dt_s)[None, None])
+        self._world = replace(self._world, tables=tables)
         self._state = self._state.changed(tick=np.array([ticks]), clear_at_s=clear_at_s, moved_at_s=moved_at_s)
         self._dt_s = dt_s
         self.set_time(time_s)
@@ -517,8 +517,7 @@ class SimulatedBody:
     def _step(self) -> list[Event]:
         task, log, shift_s = self._task, list[Event](), self._start_s
         ambient_c = self._ambient_c(self.time_s + 0.5 * self._dt_s)
-        if ambient_c != self._world.ambient_c[0, 0]:
-            self._world = replace(self._world, ambient_c=np.array([[ambient_c]]))
+        self._world.tables.ambient_c[:] = ambient_c
         leaves = task is not None and self._prepare_stint(task)
         done = step(self._world, self._state, np.array([[int(leaves)]]), self._plant, log, compiled=False)
         self._last, self._state = (self._world, done.record), done.state
@@ -530,9 +529,9 @@ class SimulatedBody:
 
     def _correct_housings(self, offset_k: float) -> None:
         """Change the estimate of the housings after a step to that from readings less an offset."""
-        observer = self._world.observer
-        less_k = observer.gain[0] @ (observer.from_winding[0] * offset_k)
-        self._state = self._state.changed(housing_c=self._state.housing_c - less_k)
+        law = self._world.tables.law[0, 0]
+        less_k = (law["housing_winding"] * offset_k) @ law["housing_gain"]
+        self._state = self._state.changed(housing_c=self._state.housing_c - less_k[:JOINTS])
 
     def _compare(self, expected: ExpectedTemperatures, record: StepRecord, ambient_c: float) -> None:
         """Compare temperatures with those expected of the heat in a step, by currents and the copper that it knows."""
@@ -548,22 +547,17 @@ class SimulatedBody:
         if not self._working:
             if task.allowed <= task.before:
                 return False
-            self._set_repetitions(task.allowed - task.before)
-            self._state = self._carried(self._world)
+            self._state = self._carried(self._world).changed(repetitions=task.allowed - task.before)
             return True
         if self._in_stint:
             todo = max(task.allowed - task.before, self._begun())
             if todo != state.todo[0, 0]:
-                self._set_repetitions(todo)  # otherwise the engine takes the job for given back
                 approach_s, cycle_s, _ = self._times_s
                 # A job that ends at this very moment has not ended for the engine yet.
                 progress_s = min(self._progress_s, approach_s + todo * cycle_s - 2 * ROUNDING_S)
+                # With fewer cycles than repetitions, the engine would take the job for given back.
                 self._state = state.changed(todo=todo, progress_s=progress_s, repetitions=todo)
         return False
-
-    def _set_repetitions(self, count: int) -> None:
-        table = replace(self._world.jobs, repetitions=np.array([[count]]))
-        self._world = replace(self._world, jobs=table)
 
     def _job_events(self, task: _Current, done: int, log: list[Event], shift_s: float) -> list[Event]:
         """Return the events of the current job in a step; drop the job where it ended.
@@ -606,7 +600,7 @@ class SimulatedBody:
     def _build_world(self, task: _Current | None, *, warm: bool = False) -> tuple[World, ProfilePlant]:
         plans = {} if task is None else {task.job.work: (task.plan,)}
         jobs = [] if task is None else [replace(task.job, release_s=0.0, due_s=np.inf, after=())]
-        world, rows = build_world(
+        world = build_world(
             [replace(self._arm, model=Blind(), plans=plans, learns=False)],
             [jobs],
             limits=self._limits,
@@ -616,7 +610,7 @@ class SimulatedBody:
             ambient_c=np.array([[self._ambient_c(self._start_s)]]),
             start_warm=warm,
         )
-        executed = [self._arm.executed.get(plan, plan) for plan in rows]
+        executed = [self._arm.executed.get(plan, plan) for plan in world.plans]
         return world, ProfilePlant(executed, self._arm.robot.home_q()[None], self._arm.rest_tau[None])
 
     def _carried(self, world: World) -> State:
@@ -643,7 +637,7 @@ class SimulatedBody:
     @property
     def _times_s(self) -> tuple[float, float, float]:
         """Durations of approach, cycle and retreat."""
-        return tuple(self._world.plans.times_s[0].tolist())
+        return tuple(self._world.tables.plans["times_s"][0].tolist())
 
     def _begun(self, *, done: bool = False) -> int:
         """Cycles of this stint that were begun, or with `done` those that are complete."""
