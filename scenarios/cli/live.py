@@ -75,7 +75,9 @@ def arm_command(
     speed: float | None = option(
         "Fleet seconds per real second. Default: the auctioneer's, else 1.", None, low=MIN_SPEED, high=MAX_SPEED
     ),
-    rate_hz: float = option("State messages per real second.", 10.0, low=0, high=100, above=True),
+    rate_hz: float = option(
+        "State messages per real second while it works; an idle arm publishes two.", 10.0, low=0, high=100, above=True
+    ),
     capacity: int = option("Maximum concurrent jobs.", 1, low=1, high=256),
     endpoint: str = options.ENDPOINT,
 ) -> None:

@@ -4,12 +4,13 @@ import os
 import socket
 import sys
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 from agents.policy import no_simulator
 from fleet.bus.security.tls import Tls
 from fleet.errors import FleetError, nearest
-from fleet.live.supervisor import Part, Supervisor
+from fleet.live.supervisor import Part, Supervisor, share_memory
 from scenarios.cli.options import flags_of, split_names
 from scenarios.extras import require_extra
 from scenarios.live.auctioneer import folder_of, refuse_other_way
@@ -22,6 +23,12 @@ from scenarios.terminal import err_console, out_console, progress_bar, say
 START_S = 60.0
 """Real seconds until a participant must be ready: an arm loads its twin."""
 PAGE_READY = "ready page "
+SHARED = (
+    *("fleet.bus.router", "scenarios.cli.live", "scenarios.live.arm", "scenarios.live.auctioneer"),
+    *("scenarios.prepare.fleet", "fleet.live.arm.body"),
+)
+"""Modules of the participants, which `up` imports once, before it forks them; none may start a thread, as pyarrow."""
+SHARED_BY_PAGE = ("scenarios.live.gateway",)
 PROGRAM = (sys.executable, "-c", "from scenarios.cli.main import main; main()")
 
 
@@ -71,6 +78,7 @@ def parts_of(
     ]
     recording = ("--out", str(folder / "recording"))
     record = part("record", "bus", "record", spec.fleet, *recording, user="recorder", rank=1)
+    record = replace(record, env={"ARROW_DEFAULT_MEMORY_POOL": "system"})  # Arrow's own keeps 10 MB after each part
     if alone:
         return router, arms, record, None
     options = flags_of(spec, *shared, *allocation)
@@ -110,8 +118,10 @@ def run_fleet(
     if plans(spec.policy):  # before anything is started
         raise no_simulator(spec.policy)
     refuse_other_way(folder / "journals", names, alone=scope_of(spec.policy) == "arm", new_epoch=spec.new_epoch)
+    for module in (*SHARED, *(SHARED_BY_PAGE if page else ())):  # before `prepare`, whose memory is then freed whole
+        import_module(module)
     with progress_bar() as progress:  # once, so that no arm has to plan or train by itself
-        prepare(chosen, difficulty=spec.difficulty, risk=spec.risk, progress=progress)
+        prepare(chosen, difficulty=spec.difficulty, risk=spec.risk, progress=progress, simulated=False)
     own_router, parts, record, auction = parts_of(
         scenario,
         names,
@@ -126,7 +136,10 @@ def run_fleet(
     at, count = router or own_router.ready, f"{len(parts)} arm{'s' * (len(parts) > 1)}"
     central = f"{count}, which allocate the jobs" if auction is None else f"{count} and the auctioneer"
     say(f"Starting {count if router else f'the router, the recorder, {central}'} …", err_console)
-    with until_stopped() as stop, Supervisor(folder / "logs") as supervisor:
+    share_memory()
+    from scenarios.cli.main import main
+
+    with until_stopped() as stop, Supervisor(folder / "logs", program=PROGRAM, main=main) as supervisor:
         if not router:
             supervisor.start(own_router, ready_s=START_S)
         # The auctioneer starts last: its clock runs from its start, and the arms must be ready by then.
