@@ -118,15 +118,21 @@ def run_fleet(
     if plans(spec.policy):  # before anything is started
         raise no_simulator(spec.policy)
     refuse_other_way(folder / "journals", names, alone=scope_of(spec.policy) == "arm", new_epoch=spec.new_epoch)
-    for module in (*SHARED, *(SHARED_BY_PAGE if page else ())):  # before `prepare`, whose memory is then freed whole
-        import_module(module)
-    with progress_bar() as progress:  # once, so that no arm has to plan or train by itself
+    wanted = (0,) if router else (PORT, 0) if port is None else (port,)
+    with (
+        hold_port(*wanted) as held,
+        progress_bar() as progress,
+    ):  # planning may take minutes, and the port is taken first
+        own_port = held.getsockname()[1]
+        for module in (*SHARED, *(SHARED_BY_PAGE if page else ())):  # first, so that the memory of `prepare` is freed
+            import_module(module)
+        # Once, so that no arm has to plan or train by itself.
         prepare(chosen, difficulty=spec.difficulty, risk=spec.risk, progress=progress, simulated=False)
     own_router, parts, record, auction = parts_of(
         scenario,
         names,
         replace(spec, fleet=fleet),
-        port=PORT if router else port or free_port(PORT if port is None else 0),
+        port=own_port,
         folder=folder,
         tls=tls,
         host=host,
@@ -226,15 +232,31 @@ def _check_place(arms: str, router: str, host: str, name: str, tls: Path | None)
         raise FleetError(f"--host {host} needs --tls: plain TCP does not authenticate, so it is limited to loopback.")
 
 
+def hold_port(*wanted: int) -> socket.socket:
+    """Socket that holds the first of these ports of 127.0.0.1 that is free, 0 for any; nothing listens there.
+
+    Raises:
+        FleetError: none is free.
+    """
+    held, reason = socket.socket(), ""
+    held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as routers do: one that has just exited is free
+    for port in wanted:
+        try:
+            held.bind(("127.0.0.1", port))
+        except OSError as error:
+            reason = error.strerror or str(error)
+        else:
+            return held
+    held.close()
+    raise FleetError(
+        f"Port {wanted[-1]} of 127.0.0.1 cannot be used ({reason}). Give another --port; 0 is any free one."
+    )
+
+
 def free_port(wanted: int = 0) -> int:
     """Port of 127.0.0.1 that is free now: the wanted one if possible; the router keeps it when it is restarted."""
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as routers do: one that has just exited is free
-        try:
-            probe.bind(("127.0.0.1", wanted))
-        except OSError:
-            probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+    with hold_port(wanted, 0) as held:
+        return held.getsockname()[1]
 
 
 def check_roster(folder: Path | None, scenario: str) -> None:
