@@ -42,7 +42,7 @@ BACKLOG = 4096
 MOST_REPLIES = 1024
 """Replies to one query that are read: one of each arm of the largest fleet."""
 
-_SENDER: Mapping[str, str] = {"arm": "arm", "auction": "auctioneer"}
+_SENDER: Mapping[str, str] = {"arm": "arm", "auction": "auctioneer", "monitor": "monitor"}
 """The field of a message that names the sender, by the role in its key."""
 
 

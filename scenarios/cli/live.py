@@ -247,6 +247,12 @@ def gateway_command(
         "may do what the ones before it may.",
         None,
     ),
+    recording: Path | None = option("Recording of the fleet, whose alarms the gateway continues.", None),
+    webhook: list[str] | None = option(
+        "URL that gets every change of an alarm; may be repeated. It is signed with THERMOFLEET_WEBHOOK_SECRET; beyond "
+        "this machine it must be https.",
+        None,
+    ),
 ) -> None:
     """Serve the fleet over HTTP until Ctrl-C or SIGTERM; with --page also a live page for browsers."""
     if scenario and not page:
@@ -260,7 +266,7 @@ def gateway_command(
 
         three_js()  # if it is missing, say so at once
         shown = LivePage(scene_of(load(scenario)) if scenario else None)
-    run_gateway(endpoint, fleet, port, host, token, tokens, shown)
+    run_gateway(endpoint, fleet, port, host, token, tokens, shown, recording, webhook or ())
 
 
 def ros2_command(

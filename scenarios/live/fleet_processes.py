@@ -138,7 +138,7 @@ def run_fleet(
         host=host,
         at=router,
     )
-    shown = page_of(scenario, fleet, router or own_router.ready, tls) if page else None
+    shown = page_of(scenario, fleet, router or own_router.ready, tls, folder / "recording") if page else None
     at, count = router or own_router.ready, f"{len(parts)} arm{'s' * (len(parts) > 1)}"
     central = f"{count}, which allocate the jobs" if auction is None else f"{count} and the auctioneer"
     say(f"Starting {count if router else f'the router, the recorder, {central}'} …", err_console)
@@ -177,11 +177,11 @@ def run_fleet(
     stop.leave(f"The fleet was stopped; journals, recording and logs are in {folder}; the same command continues.")
 
 
-def page_of(scenario: str, fleet: str, at: str, tls: Path | None) -> Part:
+def page_of(scenario: str, fleet: str, at: str, tls: Path | None, recording: Path) -> Part:
     """The live page of a fleet, on a port that is free now; it keeps the port when it is restarted."""
     endpoint, port = at if tls is None else Tls(tls, "operator").endpoint(at), free_port(PAGE_PORT)
     words = ("bus", "gateway", "--page", "--scenario", scenario, "--endpoint", endpoint, "--fleet", fleet)
-    argv = (*PROGRAM, *words, "--port", str(port))
+    argv = (*PROGRAM, *words, "--recording", str(recording), "--port", str(port))
     return Part(name="page", argv=argv, rank=1, ready=f"{PAGE_READY}http://127.0.0.1:{port}/")
 
 
