@@ -1,7 +1,7 @@
 // The live page: the fleet as its messages show it.
 "use strict";
 
-const FRESH_S = 3, DRAW_MS = 60, TABLES_MS = 500, POLL_MS = 2000, MOST_JOBS = 300, MOST_ROWS = 60, MOST_NOTES = 300, MOST_AWARDS = 20;
+const FRESH_S = 3, DRAW_MS = 60, TABLES_MS = 500, POLL_MS = 2000, MOST_JOBS = 300, MOST_ROWS = 60, MOST_NOTES = 300, MOST_AWARDS = 20, MOST_ALARMS = 20;
 const MODES = { idle: "○ idle", working: "▶ working", faulted: "✖ faulted" };
 const STATES = {
   waiting: "… waiting", awarded: "▶ awarded", finishing: "▶ finishing", finished: "✔ finished", unfinished: "? unfinished",
@@ -161,10 +161,12 @@ function startPage() {
   async function poll() {
     const snapshot = await gateway.request(`/v4/fleet?jobs=${MOST_JOBS}`);
     const nowMs = performance.now();
-    Object.assign(fleet, { name: snapshot.fleet, counts: snapshot.counts, paused: snapshot.paused, speed: snapshot.speed, auctioneers: snapshot.auctioneers });
+    Object.assign(fleet, { name: snapshot.fleet, counts: snapshot.counts, paused: snapshot.paused, speed: snapshot.speed, auctioneers: snapshot.auctioneers, alarms: snapshot.alarms });
+    const total = (field) => snapshot.arms.reduce((sum, one) => sum + one[field], 0), workedS = total("worked_s"), heated = total("heat_n2m2s");
     for (const one of snapshot.arms) {
       const arm = armOf(one.arm);
-      Object.assign(arm, { token: one.token, badSensor: one.bad_sensor, possibleC: one.temp_c });
+      Object.assign(arm, { token: one.token, badSensor: one.bad_sensor, possibleC: one.temp_c, idle: one.idle });
+      arm.shares = [[one.worked_s, workedS], [one.heat_n2m2s, heated]].map(([part, all]) => all ? `${Math.round(100 * part / all)} %` : "—").join(", ");
       if (one.state_age_s !== null) arm.atMs = Math.max(arm.atMs, nowMs - 1000 * one.state_age_s);
       arm.difficultyMs = one.difficulty_age_s === null ? null : nowMs - 1000 * one.difficulty_age_s;
     }
@@ -176,7 +178,7 @@ function startPage() {
 
   // Pictures and tables
 
-  const arms = makeTable(element("arms"), 8), jobs = makeTable(element("jobs"), 6), settled = makeTable(element("settled"), 5);
+  const arms = makeTable(element("arms"), 9), alarms = makeTable(element("alarms"), 3), jobs = makeTable(element("jobs"), 6), settled = makeTable(element("settled"), 5);
   const offered = makeTable(element("offers"), 3), present = new Map();
 
   const temperatures = (arm) => (arm.badSensor ? arm.possibleC : arm.state.temp_c);
@@ -198,7 +200,7 @@ function startPage() {
   }
 
   function fillArm(row, arm) {
-    const [name, mode, hot, job, cycles, predicted, messages, requests] = row.cells, { state } = arm, here = isPresent(arm);
+    const [name, mode, hot, job, cycles, predicted, shares, messages, requests] = row.cells, { state } = arm, here = isPresent(arm);
     if (!name.firstChild) {
       const button = make("button", { type: "button", class: "plain", title: "Look at this arm" }, visible(arm.name));
       button.addEventListener("click", () => {
@@ -222,7 +224,8 @@ function startPage() {
       bar.firstChild.style.width = `${Math.round(100 * Math.min(1, Math.max(0, share)))}%`;
       if (view) bar.firstChild.style.background = `#${view.heatColour(tempC).convertLinearToSRGB().getHexString()}`;
     } else setText(text, "—");
-    setText(job, (state && state.job) || "—");
+    setText(job, (state && state.job) || (here && arm.idle) || "—");
+    setText(shares, arm.shares || "—");
     setText(cycles, of && of.repetitions ? `${of.cycles} of ${of.repetitions}` : state && state.job_cycles_left ? `${state.job_cycles_left} left` : "—");
     const finish = of && of.finish_s != null ? `done in ${clock(of.finish_s - fleetTime())}` : "";
     const peak = state && state.job_peak_c != null ? `peak ${state.job_peak_c.toFixed(1)} °C` : "";
@@ -268,6 +271,23 @@ function startPage() {
     const text = shown.map(([arm, { peak, p, d }]) => `${arm === winner ? "✔ " : ""}${arm} ${figure(peak, 1, " °C")}, P ${figure(p, 2)}, d ${figure(d, 2)}`);
     if (shown.length < listed.length) text.push(`and ${listed.length - shown.length} more`);
     setText(row.cells[2], text.join(";  ") || (winner ? `✔ ${winner}` : "none"));
+  }
+
+  // Alarms that last and those that nobody has seen, then the last of the others.
+  function drawAlarms() {
+    const open = (alarm) => alarm.ended_s === null || !alarm.by, all = [...(fleet.alarms || [])].reverse();
+    const listed = [...all.filter(open), ...all.filter((alarm) => !open(alarm))].slice(0, MOST_ALARMS);
+    element("alarms").hidden = !listed.length;
+    alarms.update(listed.map((alarm) => [alarm.alarm, alarm]), (row, alarm) => {
+      const [what, lasts, seen] = row.cells;
+      setText(what, alarm.what);
+      setText(lasts, alarm.ended_s === null ? `since ${clock(alarm.began_s)}` : `${clock(alarm.began_s)} to ${clock(alarm.ended_s)}`);
+      setClass(row, alarm.ended_s === null && !alarm.by ? "fault" : alarm.by ? "" : "warning");
+      if (!seen.firstChild) seen.append(make("span"), make("span"));
+      const at = alarm.acknowledged ? new Date(alarm.acknowledged).toLocaleString() : "";
+      setText(seen.firstChild, alarm.by ? `${alarm.by}, ${at}` : actions.may("operator") ? "" : "nobody");
+      setButtons(seen.lastChild, alarm.by || !actions.may("operator") ? [] : [{ text: "Acknowledge", label: `Acknowledge: ${alarm.what}`, act: () => actions.acknowledge(alarm) }]);
+    });
   }
 
   const some = (names) => names.slice(0, 20).join(", ") + (names.length > 20 ? ` and ${names.length - 20} more` : "");
@@ -316,6 +336,7 @@ function startPage() {
       ...awards.map((award) => [award.key, { job: award.job, state: `✔ to ${award.arm}`, winner: award.arm, scores: award.offers }]),
     ], fillOffer);
     alerts();
+    drawAlarms();
     actions.allow();
   }
 

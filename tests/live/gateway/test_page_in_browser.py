@@ -332,3 +332,19 @@ def test_the_page_connects_again_to_a_gateway_and_a_router_that_return(browser, 
                     expect(page.locator("#arms tbody tr")).to_contain_text("○ idle")
                     expect(page.locator("#alert-list")).to_contain_text("None.")
                     assert fleet.mode == {"arm_0": "idle"}
+
+
+def test_an_alarm_stays_after_a_reload_until_somebody_has_seen_it(served, fleet, open_page):
+    fleet.post(lambda: fleet.set("lost", state="given_up", reason="three faults"))
+    page = open_page(served)
+    row = page.locator("#alarms tbody tr", has_text="'lost' is abandoned: three faults")
+    expect(row).to_contain_text("since")
+    row.get_by_role("button", name="Acknowledge").click()
+    confirm(page, "bob")
+    answer(page).to_contain_text("bob has seen it.")
+    page.reload()
+    expect(row).to_contain_text("bob, ")
+    expect(row.get_by_role("button")).to_have_count(0)
+    arms = page.locator("#arms tbody tr")
+    expect(arms.first).to_contain_text(" %")
+    expect(arms.first.locator("td[data-label='Job']")).to_contain_text("No job waits.")
