@@ -89,5 +89,5 @@ class AlarmList:
         self.alarms.pop(alarm.alarm, None)
         self.alarms[alarm.alarm] = alarm
         if len(self.alarms) > MAX_ALARMS:
-            over = next(name for name, each in self.alarms.items() if each.ended_s is not None)
-            del self.alarms[over]
+            ended = (name for name, each in self.alarms.items() if each.ended_s is not None)
+            del self.alarms[next(ended, next(iter(self.alarms)))]

@@ -432,10 +432,9 @@ def why_idle(arm: ArmSnapshot, waiting: Mapping[str, str], paused: Mapping[str, 
         return "It is above its warning limit."
     if not waiting:
         return "No job waits."
-    named = [f"{job}: {reason}" for job, reason in waiting.items() if arm.arm in reason]
-    able = sum(job in arm.scores and arm.scores[job] != JobScore() for job in waiting)
-    offers = f"It has bids for {able} of {len(waiting)} waiting jobs."
-    return f"{offers} {named[0]}" if named else offers
+    named = next((f" {job}: {reason}" for job, reason in waiting.items() if arm.arm in reason), "")
+    able = sum(job in waiting and score != JobScore() for job, score in arm.scores.items())
+    return f"It has bids for {able} of {len(waiting)} waiting jobs.{named}"
 
 
 def _complete(reply: Status) -> bool:
