@@ -38,8 +38,8 @@ def test_a_restart_continues_the_alarms_of_its_messages():
     sent = first.update([HOT, Finding("fault", "no one works", "no_progress", "space")], 10.0, 1000.0)
     sent.append(first.acknowledge(sent[0].alarm, " ann ", 12.0, NOON))
     again = AlarmList("m", sent)
-    assert again.update([HOT], 20.0, 3.0) == []
-    (ended,) = again.update([HOT], 30.0, 3.0 + HOLD_S + 0.1)
+    assert again.update([HOT], 20.0, 3000.0) == []
+    (ended,) = again.update([HOT], 30.0, 3000.0 + HOLD_S + 0.1)
     assert (ended.kind, ended.ended_s, ended.number) == ("no_progress", 30.0, 4)
     kept = again.alarms[sent[0].alarm]
     assert (kept.by, kept.acknowledged, kept.ended_s) == ("ann", "2026-01-31T12:00:00Z", None)
@@ -97,8 +97,12 @@ def test_an_arm_without_a_job_says_why(change, waiting, paused, says):
 def test_work_and_heat_are_sums_over_the_time_between_states():
     """By hand: 10 s at work with torques 3 and 4 Nm, then 5 s idle with 2 Nm: 10 s of work, 10 · 25 + 5 · 4 N²m²s."""
     view = FleetView("f")
-    for time_s, mode, tau in ((0.0, "working", (3.0, 4.0, 0.0)), (10.0, "idle", (2.0, 0.0, 0.0)), (15.0, "idle", ())):
+    for time_s, mode, tau in (
+        (0.0, "working", (3.0, 4.0, 0.0)),
+        (10.0, "idle", (2.0, 0.0, 0.0)),
+        (15.0, "idle", (1.0, 1.0, 1.0)),
+    ):
         view.update("a", state(time_s=time_s, mode=mode, tau=tau), 0.0)
-    view.update("a", state(time_s=3.0, epoch="new"), 0.0)  # another epoch has another clock
+    view.update("a", state(time_s=500.0, epoch="new", tau=(9.0, 9.0, 9.0)), 0.0)  # another epoch has another clock
     (arm,) = view.snapshot(0.0).arms
     assert (arm.worked_s, arm.heat_n2m2s) == (10.0, 270.0)
