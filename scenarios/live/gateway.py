@@ -61,6 +61,7 @@ from fleet.errors import NAME_RULE, BusError, FleetError, Refused, ScenarioError
 from fleet.live.job_client import batches
 from fleet.live.monitor.async_bridge import AsyncBridge, EventFeed, FeedEntry
 from fleet.live.monitor.snapshot import MAX_JOBS
+from fleet.live.supervisor import return_memory
 from scenarios.cli.options import the_fleet
 from scenarios.live.metrics import CONTENT_TYPE, exposition
 from scenarios.live.webhooks import SECRET, Webhook
@@ -592,8 +593,8 @@ def run_gateway(
 ) -> None:
     """Serve until a signal arrives; the arguments are the options of `thermofleet bus gateway`."""
     kept: Sequence[Alarm] = ()
-    if recording is not None:
-        from scenarios.live.recording import alarms_of  # loads Arrow, which starts a thread
+    if recording is not None and any(recording.glob("alarms-*")):
+        from scenarios.live.recording import alarms_of  # loads Arrow, 20 MB
 
         kept = alarms_of(recording)
     hooks = [Webhook(url, os.environ.get(SECRET, "")) for url in webhooks]
@@ -747,6 +748,7 @@ async def serve(
         address, bound_port, *_ = bound.getsockname()
         shown = f"[{address}]" if ":" in address else address
         kind, path = ("gateway", "/v4") if page is None else ("page", "/")
+        return_memory()
         echo(f"ready {kind} http://{shown}:{bound_port}{path} {os.getpid()}")
         await server.serve(sockets=[bound])
     return received[0]

@@ -273,10 +273,12 @@ function startPage() {
     setText(row.cells[2], text.join(";  ") || (winner ? `✔ ${winner}` : "none"));
   }
 
+  const isOpen = (alarm) => alarm.ended_s === null || !alarm.by;
+
   // Alarms that last and those that nobody has seen, then the last of the others.
   function drawAlarms() {
-    const open = (alarm) => alarm.ended_s === null || !alarm.by, all = [...(fleet.alarms || [])].reverse();
-    const listed = [...all.filter(open), ...all.filter((alarm) => !open(alarm))].slice(0, MOST_ALARMS);
+    const all = [...(fleet.alarms || [])].reverse();
+    const listed = [...all.filter(isOpen), ...all.filter((alarm) => !isOpen(alarm))].slice(0, MOST_ALARMS);
     element("alarms").hidden = !listed.length;
     alarms.update(listed.map((alarm) => [alarm.alarm, alarm]), (row, alarm) => {
       const [what, lasts, seen] = row.cells;
@@ -290,6 +292,7 @@ function startPage() {
     });
   }
 
+  // What needs attention and is no alarm.
   const some = (names) => names.slice(0, 20).join(", ") + (names.length > 20 ? ` and ${names.length - 20} more` : "");
   function alerts() {
     const list = [], all = [...fleet.arms.values()].sort(byName);
@@ -297,19 +300,12 @@ function startPage() {
     if (connected && !all.some((arm) => arm.token) && !fleet.auctioneers.some((each) => each.token)) {
       add("nobody", "fault", "No arm and no auctioneer is present: the router or the fleet may be down. This page waits for them.");
     } else {
-      const absent = all.filter((arm) => !isPresent(arm)).map((arm) => arm.name), faulted = all.filter((arm) => isPresent(arm) && arm.state.mode === "faulted");
-      for (const arm of faulted) add(`faulted/${arm.name}`, "fault", `${arm.name} is faulted.`);
-      if (absent.length) add(`absent/${absent}`, "fault", `Absent: ${some(absent)}.`);
       const warm = all.filter((arm) => heat && isPresent(arm) && Math.max(...temperatures(arm)) >= heat.warning_c)
         .map((arm) => `${arm.name} (joint ${temperatures(arm).indexOf(Math.max(...temperatures(arm))) + 1})`);
-      for (const arm of all) if (arm.badSensor) add(`sensor/${arm.name}/${arm.badSensor.slice(0, 7)}`, "warning", `${arm.name} has impossible temperatures: ${arm.badSensor}.`);
       if (warm.length) add(`warm/${warm}`, "warning", `Above the warning limit: ${some(warm)}.`);
     }
     for (const [arm, by] of Object.entries(fleet.paused)) add(`paused/${arm}/${by}`, "pause", `${arm === "*" ? "All arms are" : `${arm} is`} paused${by ? ` by ${by}` : ""}.`);
-    const unfinished = [...fleet.jobs.values()].filter(({ state }) => state === "unfinished").length;
-    if (unfinished) add(`unfinished/${unfinished}`, "warning", `${unfinished} job(s) unfinished: look at the cell, then settle each as done or redo.`);
-    if (fleet.counts.given_up) add(`given/${fleet.counts.given_up}`, "warning", `${fleet.counts.given_up} job(s) given up.`);
-    if (!list.length) add("none", "none", connected ? "None." : "Unknown while the gateway does not answer.");
+    if (!list.length && !(fleet.alarms || []).some(isOpen)) add("none", "none", connected ? "None." : "Unknown while the gateway does not answer.");
     const words = { fault: "✖ Fault: ", warning: "▲ Warning: ", pause: "❚❚ ", none: "" }, place = element("alert-list");
     const known = new Map([...place.children].map((item) => [item.dataset.key, item]));
     for (const [key, item] of known) if (!list.some(([one]) => one === key)) item.remove();
