@@ -325,11 +325,13 @@ class BusClient(Connection):
         handle: Callable[[str, Message], None],
         *,
         history: bool = False,
+        most: int | None = None,
     ) -> None:
         """Receive all messages of one key expression; `handle` gets the name in the key and the message.
 
         Args:
             history: Also receive what publishers have cached, now and after a break, and messages lost in transit.
+            most: Cached messages of each publisher, the newest; None for all.
         """
         channel = channel_for(expression, "publish", kind)
 
@@ -353,7 +355,7 @@ class BusClient(Connection):
                 self._open(),
                 expression,
                 receive,
-                history=advanced.HistoryConfig(detect_late_publishers=True, max_samples=channel.history),
+                history=advanced.HistoryConfig(detect_late_publishers=True, max_samples=most or channel.history),
                 recovery=advanced.RecoveryConfig(heartbeat=True, periodic_queries=None),
             )
         )

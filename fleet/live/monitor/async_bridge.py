@@ -7,7 +7,6 @@ behind that it has missed events is dropped, and reconnects.
 
 import asyncio
 import logging
-import math
 import threading
 import time
 from collections import deque
@@ -27,7 +26,7 @@ from fleet.bus.protocol.operator import Alarm
 from fleet.errors import BusError, Refused
 from fleet.live.monitor.alarms import AlarmList
 from fleet.live.monitor.health import check_fleet
-from fleet.live.monitor.snapshot import MAX_JOBS, FleetListener, FleetSnapshot, Recent, Role
+from fleet.live.monitor.snapshot import FRESH_S, MAX_JOBS, FleetListener, FleetSnapshot, Recent, Role
 
 _LOG = logging.getLogger(__name__)
 
@@ -129,7 +128,8 @@ class AsyncBridge:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._alarms, self._on_alarm = AlarmList(MONITOR, kept), on_alarm
         self._publish = link.publisher(keys.build(self.fleet, "monitor", "alarm", MONITOR), Alarm)
-        self._check_s, self._earlier = -math.inf, deque[FleetSnapshot](maxlen=3)
+        self._check_s = time.monotonic() + FRESH_S  # by then it has heard from everybody who is there
+        self._earlier = deque[FleetSnapshot](maxlen=3)
         for alarm in self._alarms.alarms.values():
             self._tell(alarm)
 

@@ -350,8 +350,8 @@ class FleetListener:
         self._status_due_s = time.monotonic()
         for channel, message in PUBLISHED.items():
             expression = keys.of_every(link.fleet, channel.role, channel.topic)
-            # Of a thousand cached states only the next one matters, and it comes within half a second.
-            link.subscribe(expression, message, partial(self._message, channel.topic), history=channel.topic != "state")
+            most = 1 if channel.topic == "state" else None  # of a thousand cached states only the last one matters
+            link.subscribe(expression, message, partial(self._message, channel.topic), history=True, most=most)
         link.watch_tokens(keys.of_every_arm(link.fleet, "alive"), partial(self._token, "arm"))
         link.watch_tokens(keys.of_every_auction(link.fleet, "alive"), partial(self._token, "auction"))
 
