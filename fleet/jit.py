@@ -97,14 +97,6 @@ class Kernel:
         return self.compiled if wanted else self.interpreted
 
 
-def avoid_numba() -> None:
-    """Run kernels of this process uncompiled from now on: for few calls not worth numba's 80 MB and seconds to load.
-
-    A user who sets NUMBA_DISABLE_JIT decides.
-    """
-    os.environ.setdefault("NUMBA_DISABLE_JIT", "1")
-
-
 def kernel(function: Callable[..., Any]) -> Kernel:
     """Make a function one that Python calls, compiled or not."""
     return Kernel(function)

@@ -160,6 +160,11 @@ class BusClient(Connection):
             self._participant = participant_at(self._endpoint)
         return self
 
+    @property
+    def participant(self) -> str:
+        """Its name in the roster of the keys with which it is connected; "" without one."""
+        return "" if self._participant is None else self._participant.name
+
     def close(self) -> None:
         """Disconnect; messages that were not handled are dropped. May be called twice."""
         try:

@@ -21,7 +21,6 @@ from fleet.bus.protocol.keys import STATE_HZ
 from fleet.difficulty import Blind, DifficultyModel
 from fleet.errors import BusError, FleetError, InfeasibleJob, LogError, Refused
 from fleet.files import cache_folder
-from fleet.jit import avoid_numba
 from fleet.job import Work
 from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardExecutor, ExecutorConfig
 from fleet.live.arm.body import Body, ReplayBody, SensorLog
@@ -92,8 +91,6 @@ def run_arm(
         raise FleetError("An arm that replays a log takes no jobs: leave --policy out.")
     if spec.new_epoch and not alone:
         raise FleetError("--new-epoch is for an arm with --policy, or for thermofleet bus auctioneer: leave it out.")
-    if file is None:  # a log may be scored ten times a second, jobs are scored now and then
-        avoid_numba()
     fleet, folder = folder_of(spec.journal, spec.fleet, scenario)
     refuse_other_way(folder, (name,), alone=alone, new_epoch=spec.new_epoch)
     with progress_bar() as progress:

@@ -15,7 +15,6 @@ from fleet.bus.protocol.auction import JobSpec, JobState, JobStatus, Submission
 from fleet.bus.router import other_versions
 from fleet.env.validation import actions_of
 from fleet.errors import BusError, FleetError, Refused
-from fleet.jit import avoid_numba
 from fleet.job import Job
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.node import AuctionNode
@@ -115,7 +114,6 @@ def run_auctioneer(scenario: Scenario, name: str, spec: LiveSpec, endpoint: str)
     Raises:
         FleetError: the policy is not central, or the journals are of a shift without an auctioneer.
     """
-    avoid_numba()
     bus = OnBus(fleet=spec.fleet or scenario.name, endpoint=endpoint, limit_s=ON_BUS_S)
     allocate = central_allocation(spec.policy, scenario, spec.seed, ends=spec.jobs == "scenario", bus=bus)
     own = scenario_jobs(scenario, spec.seed) if spec.jobs == "scenario" else []

@@ -64,7 +64,10 @@ def parts_of(
 
     def part(name: str, *words: str, user: str, rank: int, essential: bool = False) -> Part:
         endpoint = address if tls is None else Tls(tls, user).endpoint(address)
-        return Part(name=name, argv=(*PROGRAM, *words, "--endpoint", endpoint), rank=rank, essential=essential)
+        # What they compute now and then is not worth numba's 80 MB, and seconds to load.
+        env = {"NUMBA_DISABLE_JIT": "1"}
+        argv = (*PROGRAM, *words, "--endpoint", endpoint)
+        return Part(name=name, argv=argv, rank=rank, essential=essential, env=env)
 
     shared, allocation = ("fleet", "speed", "journal", "seed"), ("policy", "jobs", "new_epoch")
     alone, ends = scope_of(spec.policy) == "arm", spec.jobs == "scenario"

@@ -17,6 +17,7 @@ from itertools import takewhile
 from typing import Self, TypeVar
 
 import msgspec
+from msgspec.structs import replace
 
 from fleet.bus.client import BusClient, Replies, replier
 from fleet.bus.protocol import keys
@@ -38,7 +39,7 @@ REPLY_S, QUOTE_S, TURN_S = 5.0, 1.0, 0.2
 CHECK_S = 1.0
 """Real seconds between two checks for alarms."""
 MONITOR = "gateway"
-"""Name under which alarms are published."""
+"""Name under which alarms are published without a certificate, whose name would be used."""
 HISTORY = 1024
 """Events and results that are kept for slow readers, and for those that reconnect."""
 MAX_NAMES = 4096
@@ -126,12 +127,13 @@ class AsyncBridge:
         self._thread = threading.Thread(target=self._serve, name="bus", daemon=True)
         self._listener = FleetListener(link, on_message=self._message, on_presence=self._presence)
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._alarms, self._on_alarm = AlarmList(MONITOR, kept), on_alarm
-        self._publish = link.publisher(keys.build(self.fleet, "monitor", "alarm", MONITOR), Alarm)
+        name = link.participant or MONITOR
+        self._alarms, self._on_alarm = AlarmList(name, kept), on_alarm
+        self._publish = link.publisher(keys.build(self.fleet, "monitor", "alarm", name), Alarm)
         self._check_s = time.monotonic() + FRESH_S  # by then it has heard from everybody who is there
         self._earlier = deque[FleetSnapshot](maxlen=3)
         for alarm in self._alarms.alarms.values():
-            self._tell(alarm)
+            self._tell(replace(alarm, monitor=name))
 
     async def __aenter__(self) -> Self:
         self._loop = asyncio.get_running_loop()
@@ -230,7 +232,7 @@ class AsyncBridge:
     def _tell(self, alarm: Alarm) -> None:
         """Publish the state of an alarm, and show it here, also if the router forwards it to nobody."""
         self._publish(alarm)
-        self._listener.view.update(MONITOR, alarm, time.monotonic())
+        self._listener.view.update(alarm.monitor, alarm, time.monotonic())
 
     def _time_s(self) -> float:
         """Fleet time, by the last message of any arm."""
