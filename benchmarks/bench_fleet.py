@@ -24,7 +24,7 @@ from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 
-from benchmarks.harness import cells, cpu_s, options, quantiles, rss_mb, status_of
+from benchmarks.harness import cells, cpu_s, options, pss_mb, quantiles, rss_mb, status_of
 from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
@@ -130,12 +130,6 @@ class Dealer:
 
     def _now_s(self) -> float:
         return self._speed * (time.monotonic() - self._began_s)
-
-
-def pss_mb(pid: int) -> float:
-    """Proportional set size of a process, MB."""
-    shares = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
-    return next(int(line.split()[1]) for line in shares if line.startswith("Pss:")) * 1024 / 1e6
 
 
 def arms_of(folder: Path, names: list[str], endpoint: str, given: Namespace) -> list[Part]:

@@ -188,6 +188,12 @@ def rss_mb(pid: int | str = "self", *, peak: bool = False) -> float:
     return int(status_of(pid)["VmHWM" if peak else "VmRSS"].split()[0]) * 1024 / 1e6
 
 
+def pss_mb(pid: int) -> float:
+    """Proportional set size of a process, MB."""
+    shares = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    return next(int(line.split()[1]) for line in shares if line.startswith("Pss:")) * 1024 / 1e6
+
+
 @contextmanager
 def spawned(target: Callable[..., None], *arguments: object) -> Iterator[Connection]:
     """A separate process that calls `target(pipe, *arguments)`; yields the other end of its pipe.

@@ -22,6 +22,7 @@ from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.observation import FIELDS, Layout
 from scenarios.cli.main import COMMANDS, load_command
+from scenarios.live.metrics import METRICS
 from scenarios.spec.schema import RewardSpec
 from scenarios.table import markdown_table as table
 
@@ -135,6 +136,11 @@ def _span(kind: Schema, low: str, high: str) -> str:
     if high in kind:
         return f" ({kind.get(low, 0)}..{kind[high]})"
     return ", not empty" if low in kind else ""
+
+
+def _metric_table() -> str:
+    rows = [(f"`thermofleet_{name}`", kind, text) for name, (kind, text) in METRICS.items()]
+    return table(("metric", "type", "meaning"), rows)
 
 
 def _time_table() -> str:
@@ -282,6 +288,7 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "patterns": lambda: table(("pattern", "meaning"), PATTERNS.items()),
     "transport": _transport_table,
     "messages": _message_tables,
+    "metrics": _metric_table,
     "times": _time_table,
     "limits": _limit_table,
     "observation": _observation_table,

@@ -37,8 +37,8 @@ def echo(text: str, *, nl: bool = True) -> None:
     typer.echo(visible(text, "\n"), nl=nl)
 
 
-out_console = SafeConsole()
-err_console = SafeConsole(stderr=True)
+out_console = SafeConsole(emoji=False)  # a name such as `:bomb:` stays as it is
+err_console = SafeConsole(stderr=True, emoji=False)
 
 EVERY_S, AFTER_S = 30.0, 2.0
 """Without a terminal: time between two lines of one stage, and time that a stage must last to have a line."""

@@ -33,6 +33,8 @@ log = logging.getLogger(__name__)
 _written: dict[Path, int] = {}
 """Bytes that this process wrote to a folder since it last listed its files, by folder."""
 
+RANDOM_MOTIONS_VERSION = 2
+"""Version of `fleet.arm.random_motions`; increment it when the same seed gives other motions."""
 PLANNER_VERSION = 4
 """Increment it whenever the plans of the same work change."""
 MAX_CACHE_BYTES = 2_000_000_000

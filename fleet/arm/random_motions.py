@@ -21,8 +21,6 @@ from fleet.robot import JOINTS, POSTURES, Robot, angles_deg
 Array = np.ndarray
 log = logging.getLogger(__name__)
 
-RANDOM_MOTIONS_VERSION = 2
-"""Version; increment it when the same seed gives other motions."""
 MAX_DRAWS = 50
 """Samples per requested job; if all fail, the arm hardly has room to move."""
 

@@ -42,7 +42,7 @@ BACKLOG = 4096
 MOST_REPLIES = 1024
 """Replies to one query that are read: one of each arm of the largest fleet."""
 
-_SENDER: Mapping[str, str] = {"arm": "arm", "auction": "auctioneer"}
+_SENDER: Mapping[str, str] = {"arm": "arm", "auction": "auctioneer", "monitor": "monitor"}
 """The field of a message that names the sender, by the role in its key."""
 
 
@@ -159,6 +159,11 @@ class BusClient(Connection):
             super().open()
             self._participant = participant_at(self._endpoint)
         return self
+
+    @property
+    def participant(self) -> str:
+        """Its name in the roster of the keys with which it is connected; "" without one."""
+        return "" if self._participant is None else self._participant.name
 
     def close(self) -> None:
         """Disconnect; messages that were not handled are dropped. May be called twice."""
@@ -325,11 +330,13 @@ class BusClient(Connection):
         handle: Callable[[str, Message], None],
         *,
         history: bool = False,
+        most: int | None = None,
     ) -> None:
         """Receive all messages of one key expression; `handle` gets the name in the key and the message.
 
         Args:
             history: Also receive what publishers have cached, now and after a break, and messages lost in transit.
+            most: Cached messages of each publisher, the newest; None for all.
         """
         channel = channel_for(expression, "publish", kind)
 
@@ -353,7 +360,7 @@ class BusClient(Connection):
                 self._open(),
                 expression,
                 receive,
-                history=advanced.HistoryConfig(detect_late_publishers=True, max_samples=channel.history),
+                history=advanced.HistoryConfig(detect_late_publishers=True, max_samples=most or channel.history),
                 recovery=advanced.RecoveryConfig(heartbeat=True, periodic_queries=None),
             )
         )

@@ -1,5 +1,7 @@
 """Run the processes of a fleet: one log each, restarts with back-off, ordered shutdown."""
 
+import ctypes
+import gc
 import logging
 import os
 import signal
@@ -7,9 +9,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+import traceback
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import NoReturn
 
 from fleet.bus.mailbox import Mailbox
 from fleet.errors import FleetError
@@ -102,14 +107,26 @@ class Supervisor:
         folder: Folder of the logs, `NAME.log`.
     """
 
-    def __init__(self, folder: Path, *, backoff: Backoff | None = None, patience_s: float = 10.0) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        backoff: Backoff | None = None,
+        patience_s: float = 10.0,
+        program: Sequence[str] = (),
+        main: Callable[[Sequence[str]], object] | None = None,
+    ) -> None:
         """Prepare.
 
         Args:
             patience_s: Real seconds between SIGTERM and SIGKILL when a process is stopped.
+            program: Start of the command lines that `main` runs, too.
+            main: Runs the rest of such a command line in a fork of this process, so that all share the memory of the
+                modules that it has imported. None, or where forks are not safe: every command line is executed.
         """
         self.folder = folder
         self._backoff, self._patience_s = backoff or Backoff(), patience_s
+        self._program, self._main = tuple(program), main
         self._parts: dict[str, _Running] = {}
         self._ended: Mailbox[str] = Mailbox()
 
@@ -231,6 +248,10 @@ class Supervisor:
         part = running.part
         running.ready.clear()
         running.began_s = time.monotonic()
+        env = {**os.environ, "PYTHONUNBUFFERED": "1", SUPERVISED: str(os.getpid()), **part.env}
+        run, words = None, part.argv[len(self._program) :]
+        if self._main is not None and part.argv == (*self._program, *words) and _may_fork():
+            run = partial(_run_in_fork, self._main, part.name, words, env)
         process = subprocess.Popen(
             part.argv,
             stdin=subprocess.DEVNULL,
@@ -238,8 +259,9 @@ class Supervisor:
             stderr=subprocess.STDOUT,
             text=True,
             errors="replace",
-            env={**os.environ, "PYTHONUNBUFFERED": "1", SUPERVISED: str(os.getpid()), **part.env},
+            env=env,
             start_new_session=True,  # Ctrl-C goes to the supervisor alone, which stops them in order
+            preexec_fn=run,
         )
         running.process = process
         running.copier = threading.Thread(target=self._copy_log, args=(running, process), daemon=True)
@@ -285,6 +307,57 @@ class Supervisor:
         return False
 
 
+def _may_fork() -> bool:
+    """Whether a fork of this process can work: none but Python's own threads run in it."""
+    sys.stdout.flush()  # or the fork would write it again
+    sys.stderr.flush()
+    return sys.platform == "linux" and len(os.listdir("/proc/self/task")) == threading.active_count()
+
+
+def _run_in_fork(
+    main: Callable[[Sequence[str]], object], name: str, words: Sequence[str], env: Mapping[str, str]
+) -> NoReturn:
+    """Run a command line in this fork of the supervisor, whose `Popen` would execute it after the return."""
+    code: object = 1
+    try:
+        null = os.open(os.devnull, os.O_RDWR)
+        for number in map(int, os.listdir("/proc/self/fd")):
+            if (
+                number > 2 and number != null
+            ):  # not closed, so that no object of the supervisor can close a new file of this number
+                os.dup2(null, number, inheritable=False)
+        os.environ.update(env)
+        signal.set_wakeup_fd(-1)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        logging.getLogger().handlers.clear()
+        sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
+        ctypes.CDLL(None).prctl(15, name.encode()[:15])  # PR_SET_NAME: shown by `ps` and `top`
+        gc.enable()  # `Popen` disables it meanwhile
+        main(words)
+        code = 0
+    except SystemExit as end:
+        code = end.code
+    except BaseException:
+        traceback.print_exc()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code if isinstance(code, int) else int(code is not None))
+
+
+def share_memory() -> None:
+    """Prepare the memory of this process for forks: garbage collection in them leaves shared pages as they are."""
+    return_memory()
+    gc.freeze()
+
+
+def return_memory() -> None:
+    """Return freed memory to the system, after a step that needed much (Linux with glibc)."""
+    gc.collect()
+    if sys.platform == "linux":
+        getattr(ctypes.CDLL(None), "malloc_trim", int)(0)
+
+
 def exit_with_supervisor() -> None:
     """Have the kernel stop this process when its supervisor exits; called by participants.
 
@@ -293,8 +366,6 @@ def exit_with_supervisor() -> None:
     supervisor = os.environ.get(SUPERVISED)
     if supervisor is None or sys.platform != "linux":
         return
-    import ctypes
-
     ctypes.CDLL(None).prctl(1, signal.SIGTERM)
     if os.getppid() != int(supervisor):  # it exited before the call
         os.kill(os.getpid(), signal.SIGTERM)

@@ -3,7 +3,7 @@
 from dataclasses import MISSING, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -14,6 +14,9 @@ from scenarios.cli import options
 from scenarios.cli.options import From, Given
 from scenarios.spec.options import PAGE_PORT, PORT, LiveSpec
 from scenarios.terminal import echo, out_console, say
+
+if TYPE_CHECKING:
+    from scenarios.spec.schema import Scenario
 
 UNHEALTHY = 1
 """Exit code of `bus doctor`; 0 is a healthy fleet, and 2, as for every error of use, one that cannot be reached."""
@@ -75,7 +78,9 @@ def arm_command(
     speed: float | None = option(
         "Fleet seconds per real second. Default: the auctioneer's, else 1.", None, low=MIN_SPEED, high=MAX_SPEED
     ),
-    rate_hz: float = option("State messages per real second.", 10.0, low=0, high=100, above=True),
+    rate_hz: float = option(
+        "State messages per real second while it works; an idle arm publishes two.", 10.0, low=0, high=100, above=True
+    ),
     capacity: int = option("Maximum concurrent jobs.", 1, low=1, high=256),
     endpoint: str = options.ENDPOINT,
 ) -> None:
@@ -145,6 +150,12 @@ def router_command(
         stop.leave("The router was interrupted; its clients keep trying to reconnect.")
 
 
+def _load(scenario: str) -> "Scenario":
+    from scenarios.spec.load import load  # loads the simulator, which most calls of these commands do not need
+
+    return load(scenario)
+
+
 def watch_command(
     endpoint: str = options.ENDPOINT,
     fleet: str = options.FLEET,
@@ -154,9 +165,9 @@ def watch_command(
 ) -> None:
     """Watch temperatures, difficulty, jobs and the age of messages, until the fleet ends or Ctrl-C."""
     from scenarios.show.watch import watch
-    from scenarios.spec.load import load
 
-    watch(endpoint, fleet, as_json=as_json, joints=joints, end_s=load(scenario).horizon_s if scenario else None)
+    end_s = _load(scenario).horizon_s if scenario else None
+    watch(endpoint, fleet, as_json=as_json, joints=joints, end_s=end_s)
 
 
 def doctor_command(
@@ -172,9 +183,8 @@ def doctor_command(
     Exit code 0: healthy; 1: a fault was found, or no fleet; 2: the router cannot be reached.
     """
     from scenarios.live.doctor import diagnose
-    from scenarios.spec.load import load
 
-    expected = tuple(arm.name for arm in load(scenario).arms) if scenario else ()
+    expected = tuple(arm.name for arm in _load(scenario).arms) if scenario else ()
     healthy = diagnose(endpoint, fleet, seconds, auctioneer=auctioneer, expected=expected, as_json=as_json)
     raise typer.Exit(0 if healthy else UNHEALTHY)
 
@@ -245,6 +255,12 @@ def gateway_command(
         "may do what the ones before it may.",
         None,
     ),
+    recording: Path | None = option("Recording of the fleet, whose alarms the gateway continues.", None),
+    webhook: list[str] | None = option(
+        "URL that gets every change of an alarm; may be repeated. It is signed with THERMOFLEET_WEBHOOK_SECRET; beyond "
+        "this machine it must be https.",
+        None,
+    ),
 ) -> None:
     """Serve the fleet over HTTP until Ctrl-C or SIGTERM; with --page also a live page for browsers."""
     if scenario and not page:
@@ -258,7 +274,7 @@ def gateway_command(
 
         three_js()  # if it is missing, say so at once
         shown = LivePage(scene_of(load(scenario)) if scenario else None)
-    run_gateway(endpoint, fleet, port, host, token, tokens, shown)
+    run_gateway(endpoint, fleet, port, host, token, tokens, shown, recording, webhook or ())
 
 
 def ros2_command(

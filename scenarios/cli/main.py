@@ -8,6 +8,7 @@ import logging
 import os
 import sys
 from collections.abc import Sequence
+from functools import cache
 from importlib import import_module
 from itertools import zip_longest
 from typing import Annotated, Any, NamedTuple
@@ -186,6 +187,12 @@ def _options(
     pass
 
 
+@cache
+def _command() -> Any:
+    """The commands; forks of `up` share them."""
+    return typer.main.get_command(app)
+
+
 def _given(error: typer.TyperException, words: Sequence[str]) -> str | None:
     """The last value of the option that an error is about, which typer's own messages leave out; None without one."""
     options, given = getattr(getattr(error, "param", None), "opts", ()), None
@@ -202,7 +209,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     # The matrices of an arm are small: threads of NumPy's library would only wait for each other. Torch has its own.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
-        code = app(args=list(argv) if argv is not None else None, prog_name="thermofleet", standalone_mode=False)
+        code = _command()(list(argv) if argv is not None else None, prog_name="thermofleet", standalone_mode=False)
     except Interrupted as interrupted:
         say(str(interrupted))
         sys.exit(INTERRUPTED)

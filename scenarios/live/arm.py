@@ -31,6 +31,7 @@ from fleet.live.consensus.jobs import GrantRecord
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
 from fleet.live.journal import CompactingJournal, Journal, own_records, quarantine
+from fleet.live.supervisor import return_memory
 from fleet.motion import Plan
 from scenarios.live.auctioneer import folder_of, live_fleet, refuse_other_way, scenario_jobs, summary
 from scenarios.live.cell import cell_of
@@ -113,6 +114,7 @@ def run_arm(
             source = partial(ConsensusNode, membership=membership, journal=grants, new_epoch=spec.new_epoch)
 
         node = make_node(link, book, arm, scenario, speed=speed, rate_hz=rate_hz, capacity=capacity, work_source=source)
+        return_memory()
         echo(f"ready {name} {endpoint} {os.getpid()}")
         if alone and serve_until_done(node, stop):
             return

@@ -21,6 +21,7 @@ from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.records import AuctionRecord, salvage
 from fleet.live.auction.rounds import Allocate, Assignment, Bidding, Timing, resolve_claims
 from fleet.live.journal import Journal, quarantine
+from fleet.live.supervisor import return_memory
 from scenarios.live.cell import cell_of
 from scenarios.policy_loader import ON_BUS, OnBus, policy_at, scope_of, without_simulator
 from scenarios.result_folder import disk_errors
@@ -143,6 +144,7 @@ def run_auctioneer(scenario: Scenario, name: str, spec: LiveSpec, endpoint: str)
         )
         for sentence in other_versions(endpoint, fleet):
             _LOG.error("Refused: %s", sentence)
+        return_memory()
         echo(f"ready {name} {endpoint} {os.getpid()}")
         ledger = node.auctioneer.ledger
         if ledger.jobs:

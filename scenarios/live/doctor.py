@@ -3,6 +3,7 @@
 import re
 import socket
 import time
+from collections import Counter
 from dataclasses import replace
 
 import msgspec
@@ -13,7 +14,7 @@ from fleet.bus.protocol.auction import Clock, ClockRequest
 from fleet.bus.router import fleets_at, other_versions
 from fleet.bus.security.tls import identified, why_not
 from fleet.errors import BusError
-from fleet.live.monitor.health import ClockProbe, HealthReport, check_health
+from fleet.live.monitor.health import MOST_REASONS, ClockProbe, HealthReport, check_health
 from fleet.live.monitor.snapshot import FleetListener, FleetSnapshot
 from scenarios.show.watch import arm_table, format_time, jobs_line, space_line
 from scenarios.terminal import echo, out_console, say
@@ -124,10 +125,17 @@ def show(endpoint: str, fleet: FleetSnapshot, report: HealthReport) -> None:
         out_console.print(arm_table(fleet.arms))
     out_console.print(jobs_line(fleet))
     out_console.print(space_line(fleet))
+    shown: Counter[str] = Counter()
     for finding in report.findings:
+        shown[finding.kind] += bool(finding.kind)
+        if shown[finding.kind] > MOST_REASONS:
+            continue
         out_console.print(
             f"{finding.level}: {finding.what}", style=_COLORS.get(finding.level, ""), highlight=False, markup=False
         )
+    for kind, count in shown.items():
+        if count > MOST_REASONS:
+            say(f"… and {count - MOST_REASONS} more of the kind {kind}; --json has all.", out_console)
     out_console.print("The fleet is healthy." if report.healthy else "The fleet is not healthy.", highlight=False)
 
 

@@ -4,12 +4,13 @@ import os
 import socket
 import sys
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 from agents.policy import no_simulator
 from fleet.bus.security.tls import Tls
 from fleet.errors import FleetError, nearest
-from fleet.live.supervisor import Part, Supervisor
+from fleet.live.supervisor import Part, Supervisor, share_memory
 from scenarios.cli.options import flags_of, split_names
 from scenarios.extras import require_extra
 from scenarios.live.auctioneer import folder_of, refuse_other_way
@@ -22,6 +23,12 @@ from scenarios.terminal import err_console, out_console, progress_bar, say
 START_S = 60.0
 """Real seconds until a participant must be ready: an arm loads its twin."""
 PAGE_READY = "ready page "
+SHARED = (
+    *("fleet.bus.router", "scenarios.cli.live", "scenarios.live.arm", "scenarios.live.auctioneer"),
+    *("scenarios.prepare.fleet", "fleet.live.arm.body"),
+)
+"""Modules of the participants, which `up` imports once, before it forks them; none may start a thread, as pyarrow."""
+SHARED_BY_PAGE = ("scenarios.live.gateway",)
 PROGRAM = (sys.executable, "-c", "from scenarios.cli.main import main; main()")
 
 
@@ -57,7 +64,10 @@ def parts_of(
 
     def part(name: str, *words: str, user: str, rank: int, essential: bool = False) -> Part:
         endpoint = address if tls is None else Tls(tls, user).endpoint(address)
-        return Part(name=name, argv=(*PROGRAM, *words, "--endpoint", endpoint), rank=rank, essential=essential)
+        # What they compute now and then is not worth numba's 80 MB, and seconds to load.
+        env = {"NUMBA_DISABLE_JIT": "1"}
+        argv = (*PROGRAM, *words, "--endpoint", endpoint)
+        return Part(name=name, argv=argv, rank=rank, essential=essential, env=env)
 
     shared, allocation = ("fleet", "speed", "journal", "seed"), ("policy", "jobs", "new_epoch")
     alone, ends = scope_of(spec.policy) == "arm", spec.jobs == "scenario"
@@ -71,6 +81,7 @@ def parts_of(
     ]
     recording = ("--out", str(folder / "recording"))
     record = part("record", "bus", "record", spec.fleet, *recording, user="recorder", rank=1)
+    record = replace(record, env={"ARROW_DEFAULT_MEMORY_POOL": "system"})  # Arrow's own keeps 10 MB after each part
     if alone:
         return router, arms, record, None
     options = flags_of(spec, *shared, *allocation)
@@ -110,23 +121,34 @@ def run_fleet(
     if plans(spec.policy):  # before anything is started
         raise no_simulator(spec.policy)
     refuse_other_way(folder / "journals", names, alone=scope_of(spec.policy) == "arm", new_epoch=spec.new_epoch)
-    with progress_bar() as progress:  # once, so that no arm has to plan or train by itself
-        prepare(chosen, difficulty=spec.difficulty, risk=spec.risk, progress=progress)
+    wanted = (0,) if router else (PORT, 0) if port is None else (port,)
+    with (
+        hold_port(*wanted) as held,
+        progress_bar() as progress,
+    ):  # planning may take minutes, and the port is taken first
+        own_port = held.getsockname()[1]
+        for module in (*SHARED, *(SHARED_BY_PAGE if page else ())):  # first, so that the memory of `prepare` is freed
+            import_module(module)
+        # Once, so that no arm has to plan or train by itself.
+        prepare(chosen, difficulty=spec.difficulty, risk=spec.risk, progress=progress, simulated=False)
     own_router, parts, record, auction = parts_of(
         scenario,
         names,
         replace(spec, fleet=fleet),
-        port=PORT if router else port or free_port(PORT if port is None else 0),
+        port=own_port,
         folder=folder,
         tls=tls,
         host=host,
         at=router,
     )
-    shown = page_of(scenario, fleet, router or own_router.ready, tls) if page else None
+    shown = page_of(scenario, fleet, router or own_router.ready, tls, folder / "recording") if page else None
     at, count = router or own_router.ready, f"{len(parts)} arm{'s' * (len(parts) > 1)}"
     central = f"{count}, which allocate the jobs" if auction is None else f"{count} and the auctioneer"
     say(f"Starting {count if router else f'the router, the recorder, {central}'} …", err_console)
-    with until_stopped() as stop, Supervisor(folder / "logs") as supervisor:
+    share_memory()
+    from scenarios.cli.main import main
+
+    with until_stopped() as stop, Supervisor(folder / "logs", program=PROGRAM, main=main) as supervisor:
         if not router:
             supervisor.start(own_router, ready_s=START_S)
         # The auctioneer starts last: its clock runs from its start, and the arms must be ready by then.
@@ -158,11 +180,11 @@ def run_fleet(
     stop.leave(f"The fleet was stopped; journals, recording and logs are in {folder}; the same command continues.")
 
 
-def page_of(scenario: str, fleet: str, at: str, tls: Path | None) -> Part:
+def page_of(scenario: str, fleet: str, at: str, tls: Path | None, recording: Path) -> Part:
     """The live page of a fleet, on a port that is free now; it keeps the port when it is restarted."""
     endpoint, port = at if tls is None else Tls(tls, "operator").endpoint(at), free_port(PAGE_PORT)
     words = ("bus", "gateway", "--page", "--scenario", scenario, "--endpoint", endpoint, "--fleet", fleet)
-    argv = (*PROGRAM, *words, "--port", str(port))
+    argv = (*PROGRAM, *words, "--recording", str(recording), "--port", str(port))
     return Part(name="page", argv=argv, rank=1, ready=f"{PAGE_READY}http://127.0.0.1:{port}/")
 
 
@@ -213,15 +235,31 @@ def _check_place(arms: str, router: str, host: str, name: str, tls: Path | None)
         raise FleetError(f"--host {host} needs --tls: plain TCP does not authenticate, so it is limited to loopback.")
 
 
+def hold_port(*wanted: int) -> socket.socket:
+    """Socket that holds the first of these ports of 127.0.0.1 that is free, 0 for any; nothing listens there.
+
+    Raises:
+        FleetError: none is free.
+    """
+    held, reason = socket.socket(), ""
+    held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as routers do: one that has just exited is free
+    for port in wanted:
+        try:
+            held.bind(("127.0.0.1", port))
+        except OSError as error:
+            reason = error.strerror or str(error)
+        else:
+            return held
+    held.close()
+    raise FleetError(
+        f"Port {wanted[-1]} of 127.0.0.1 cannot be used ({reason}). Give another --port; 0 is any free one."
+    )
+
+
 def free_port(wanted: int = 0) -> int:
     """Port of 127.0.0.1 that is free now: the wanted one if possible; the router keeps it when it is restarted."""
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as routers do: one that has just exited is free
-        try:
-            probe.bind(("127.0.0.1", wanted))
-        except OSError:
-            probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+    with hold_port(wanted, 0) as held:
+        return held.getsockname()[1]
 
 
 def check_roster(folder: Path | None, scenario: str) -> None:

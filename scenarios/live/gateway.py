@@ -15,8 +15,9 @@ import os
 import secrets
 import signal
 import socket
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping, Sequence
+from contextlib import AsyncExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from http import HTTPStatus
@@ -46,6 +47,7 @@ from fleet.bus.protocol.auction import JobSpec, QuoteRequest, Status, StatusRequ
 from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.messages import MalformedMessage, decode, encode
 from fleet.bus.protocol.operator import (
+    Alarm,
     Cleared,
     ClearRequest,
     Controlled,
@@ -59,7 +61,10 @@ from fleet.errors import NAME_RULE, BusError, FleetError, Refused, ScenarioError
 from fleet.live.job_client import batches
 from fleet.live.monitor.async_bridge import AsyncBridge, EventFeed, FeedEntry
 from fleet.live.monitor.snapshot import MAX_JOBS
+from fleet.live.supervisor import return_memory
 from scenarios.cli.options import the_fleet
+from scenarios.live.metrics import CONTENT_TYPE, exposition
+from scenarios.live.webhooks import SECRET, Webhook
 from scenarios.signals import until_stopped
 from scenarios.spec.job_table import read_job_table, shift_begin, with_cell
 from scenarios.spec.schema import Scenario
@@ -274,6 +279,14 @@ class AskBody(msgspec.Struct, frozen=True):
     jobs: tuple[JobSpec, ...]
 
 
+class AcknowledgeBody(msgspec.Struct, frozen=True):
+    """Body of /v4/alarms: a person has seen an alarm."""
+
+    alarm: str
+    by: Person
+    """Who has seen it."""
+
+
 class ResetBody(msgspec.Struct, frozen=True):
     """Body of /v4/reset: clear the fault of an arm."""
 
@@ -376,6 +389,22 @@ def application(
         key = keys.of_arm(bridge.fleet, body.arm, "reset")
         return json_response(await ask(key, ResetRequest(body.by), ResetReply))
 
+    async def metrics(request: Request) -> Response:
+        fleet = await bridge.snapshot()
+        lasting = (alarm for alarm in fleet.alarms if alarm.ended_s is None)
+        alarms = Counter((alarm.kind, "yes" if alarm.by else "no") for alarm in lasting)
+        return Response(exposition(fleet, alarms), media_type=CONTENT_TYPE, headers={"Cache-Control": "no-store"})
+
+    async def get_alarms(request: Request) -> Response:
+        return json_response((await bridge.snapshot(0)).alarms)
+
+    async def post_alarm(request: Request) -> Response:
+        body = await read_body(request, AcknowledgeBody)
+        try:
+            return json_response(await bridge.acknowledge(body.alarm, body.by))
+        except Refused as error:
+            raise HttpProblem(HTTPStatus.CONFLICT, str(error)) from error
+
     async def ask_cell() -> Cell:
         return await ask(keys.of_jobs(bridge.fleet, "cell"), CellRequest(), Cell)
 
@@ -413,6 +442,9 @@ def application(
         ("POST", "/v4/control", "operator", control, "Cancel, settle, change, pause, resume: a ControlRequest."),
         ("POST", "/v4/clear", "operator", clear, "Free the space of an offline arm: a ClearRequest."),
         ("POST", "/v4/reset", "operator", post_reset, 'Clear the fault of an arm: {"arm": …, "by": …}.'),
+        ("GET", "/v4/alarms", "monitor", get_alarms, "Alarms that last, and the last of the others."),
+        ("POST", "/v4/alarms", "operator", post_alarm, 'Acknowledge an alarm: {"alarm": …, "by": …}.'),
+        ("GET", "/metrics", "monitor", metrics, "Figures in the text format of Prometheus."),
         ("POST", "/v4/ask", "submitter", post_ask, 'Quotes without submitting: {"jobs": […]}.'),
     ]
     routes = [Route(path, _checked(role, handle), methods=[method]) for method, path, role, handle, _ in table]
@@ -549,9 +581,23 @@ def scene_of(scenario: Scenario) -> dict[str, Any]:  # values of JSON
 
 
 def run_gateway(
-    endpoint: str, fleet: str, port: int, host: str, token: str, tokens: Path | None, page: LivePage | None = None
+    endpoint: str,
+    fleet: str,
+    port: int,
+    host: str,
+    token: str,
+    tokens: Path | None,
+    page: LivePage | None = None,
+    recording: Path | None = None,
+    webhooks: Sequence[str] = (),
 ) -> None:
     """Serve until a signal arrives; the arguments are the options of `thermofleet bus gateway`."""
+    kept: Sequence[Alarm] = ()
+    if recording is not None and any(recording.glob("alarms-*")):
+        from scenarios.live.recording import alarms_of  # loads Arrow, 20 MB
+
+        kept = alarms_of(recording)
+    hooks = [Webhook(url, os.environ.get(SECRET, "")) for url in webhooks]
     roles = read_tokens(tokens) if tokens else {}
     if token:
         roles[check_token(token)] = "operator"
@@ -561,7 +607,7 @@ def run_gateway(
         with until_stopped() as stop:
             link = BusClient(endpoint, name, stopped=stop.is_set).open()
         with link:
-            number = asyncio.run(serve(link, bound, roles, page))
+            number = asyncio.run(serve(link, bound, roles, page, kept=kept, hooks=hooks))
     if number == signal.SIGINT:
         raise Interrupted("The gateway was interrupted.")
 
@@ -668,10 +714,30 @@ def _protocol() -> type[H11Protocol]:
     return Protocol
 
 
-async def serve(link: BusClient, bound: socket.socket, tokens: Mapping[str, Role], page: LivePage | None = None) -> int:
-    """Serve until a signal arrives; return its number."""
+async def serve(
+    link: BusClient,
+    bound: socket.socket,
+    tokens: Mapping[str, Role],
+    page: LivePage | None = None,
+    *,
+    kept: Sequence[Alarm] = (),
+    hooks: Sequence[Webhook] = (),
+) -> int:
+    """Serve until a signal arrives; return its number.
+
+    Args:
+        kept: Alarms of a recording.
+        hooks: Targets of new alarms.
+    """
     readers, received = Readers(), [0]
-    async with AsyncBridge(link, readers.wake) as bridge:
+
+    def tell(alarm: Alarm) -> None:
+        for hook in hooks:
+            hook.send(alarm)
+
+    async with AsyncBridge(link, readers.wake, kept=kept, on_alarm=tell) as bridge, AsyncExitStack() as running:
+        for hook in hooks:
+            running.callback(asyncio.create_task(hook.run()).cancel)
         server = Server(application(bridge, readers, tokens=tokens, page=page), readers)
 
         def stop(number: int) -> None:
@@ -682,6 +748,7 @@ async def serve(link: BusClient, bound: socket.socket, tokens: Mapping[str, Role
         address, bound_port, *_ = bound.getsockname()
         shown = f"[{address}]" if ":" in address else address
         kind, path = ("gateway", "/v4") if page is None else ("page", "/")
+        return_memory()
         echo(f"ready {kind} http://{shown}:{bound_port}{path} {os.getpid()}")
         await server.serve(sockets=[bound])
     return received[0]

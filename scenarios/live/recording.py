@@ -1,10 +1,11 @@
 """Recordings of a live fleet: their format, how they are read, also while they grow, and replay on the bus.
 
-`recording.json` describes the recording. `telemetry-000001.parquet`, `events-…`, `results-…`, `operations-…` and
-`gaps-…` are its parts; columns are fields of the messages `State`, `ArmEvent`, `Result` and `Operation`. A row of
-`gaps` names missing messages of a sender, and the reason.
+`recording.json` describes the recording. `telemetry-000001.parquet`, `events-…`, `results-…`, `operations-…`,
+`alarms-…` and `gaps-…` are its parts; columns are fields of the messages `State`, `ArmEvent`, `Result`, `Operation` and
+`Alarm`. A row of `gaps` names missing messages of a sender, and the reason.
 """
 
+import io
 import json
 import math
 import time
@@ -18,20 +19,20 @@ import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 from msgspec import inspect, structs
+from pyarrow.json import ParseOptions, ReadOptions, read_json
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
 from fleet.bus.protocol.cell import Cell
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import ControlRequest, Operation
+from fleet.bus.protocol.operator import Alarm, ControlRequest, Operation
 from fleet.errors import FleetError
 from fleet.events import Event
 from fleet.robot import JOINTS
-from scenarios.run.log import OF_EVENTS, open_run, record_table
 
-Message = State | ArmEvent | Result | Operation
-Kind = Literal["telemetry", "events", "results", "operations", "gaps"]
+Message = State | ArmEvent | Result | Operation | Alarm
+Kind = Literal["telemetry", "events", "results", "operations", "alarms", "gaps"]
 
 
 class Source(NamedTuple):
@@ -47,6 +48,7 @@ SOURCES: Mapping[Kind, Source] = {
     "events": Source("arm", "event", ArmEvent),
     "results": Source("auction", "result", Result),
     "operations": Source("auction", "operation", Operation),
+    "alarms": Source("monitor", "alarm", Alarm),
 }
 KINDS: tuple[Kind, ...] = (*SOURCES, "gaps")
 RECORDING_FORMAT = 7
@@ -139,6 +141,7 @@ SCHEMAS: dict[Kind, pa.Schema] = {
         {"time_s": pa.float64(), **_columns(Operation), **_columns(ControlRequest)}
         | {name: pa.string() for name in ("action", "job", "arm", "content")}
     ),
+    "alarms": pa.schema({"time_s": pa.float64(), **_columns(Alarm)}),
     "gaps": pa.schema({"time_s": pa.float64(), **_columns(Gap)}),
 }
 
@@ -150,6 +153,8 @@ def to_row(record: Message | Gap) -> tuple[Kind, dict[str, object]]:
             return "gaps", structs.asdict(record)
         case ArmEvent():
             return "events", structs.asdict(record)
+        case Alarm():
+            return "alarms", structs.asdict(record)
         case Result():
             fields = structs.asdict(record)
             fields["offers"] = msgspec.json.encode(record.offers).decode() if record.offers else ""
@@ -198,8 +203,10 @@ def part_files(folder: Path, kind: Kind) -> list[Path]:
 
 
 def to_table(kind: Kind, rows: list[dict[str, object]]) -> pa.Table:
-    """Rows as a table with the columns of their kind."""
-    return pa.Table.from_pylist(rows, schema=SCHEMAS[kind])
+    """Rows, one or more, as a table with the columns of their kind."""
+    lines = io.BytesIO(b"\n".join(map(msgspec.json.encode, rows)))  # `from_pylist` loads pandas: 40 MB
+    options = ParseOptions(explicit_schema=SCHEMAS[kind], unexpected_field_behavior="ignore")
+    return read_json(lines, ReadOptions(use_threads=False), options)
 
 
 def read_parts(folder: Path, kind: Kind) -> pa.Table:
@@ -242,11 +249,13 @@ class RecordedMessages:
     events: pa.Table
     results: pa.Table
     operations: pa.Table
+    alarms: pa.Table
     warning_c: float = 60.0
     """Warning limit of the headroom, if no headroom was recorded."""
 
     def __len__(self) -> int:
-        return sum(table.num_rows for table in (self.telemetry, self.events, self.results, self.operations))
+        tables = (self.telemetry, self.events, self.results, self.operations, self.alarms)
+        return sum(table.num_rows for table in tables)
 
     def __iter__(self) -> Iterator[Message]:
         """All messages in order of time."""
@@ -255,6 +264,7 @@ class RecordedMessages:
             _events(self.events),
             map(_result, self.results.to_pylist()),
             map(_operation, self.operations.to_pylist()),
+            (msgspec.convert(row, Alarm) for row in self.alarms.to_pylist()),
         )
         return merge(*streams, key=lambda message: message.time_s)
 
@@ -269,9 +279,18 @@ def open_messages(folder: Path) -> RecordedMessages:
         return RecordedMessages(read_card(folder).fleet, *(read_parts(folder, kind) for kind in SOURCES))
     if not (folder / "run.json").exists():
         raise FleetError(f"'{folder}' is neither the folder of a run (run.json) nor a recording of the bus ({CARD}).")
+    from scenarios.run.log import OF_EVENTS, open_run, record_table  # loads the environment: no part of a recorder
+
     run, none = open_run(folder), pa.table({})
     events = record_table(Event, run.events, **OF_EVENTS)
-    return RecordedMessages(run.scenario.name, run.telemetry, events, none, none, run.limits.warning_c)
+    return RecordedMessages(run.scenario.name, run.telemetry, events, none, none, none, run.limits.warning_c)
+
+
+def alarms_of(folder: Path) -> list[Alarm]:
+    """Every change of an alarm in a recording, in order; none of a folder without one yet."""
+    if not (folder / CARD).exists():
+        return []
+    return [msgspec.convert(row, Alarm) for row in read_parts(folder, "alarms").to_pylist()]
 
 
 def states(table: pa.Table, *, warning_c: float = 60.0) -> Iterator[State]:
@@ -341,7 +360,11 @@ def replay(messages: RecordedMessages, link: BusClient, *, speed: float, stopped
         if stopped():
             break
         source = next(source for source in SOURCES.values() if isinstance(message, source.message))
-        sender = message.auctioneer if isinstance(message, Result | Operation) else message.arm
+        match message:
+            case Result(auctioneer=sender) | Operation(auctioneer=sender) | Alarm(monitor=sender):
+                pass
+            case State(arm=sender) | ArmEvent(arm=sender):
+                pass
         key = str(keys.ParsedKey(link.fleet, source.role, sender, source.topic))
         if key not in publishers:
             publishers[key] = link.publisher(key, source.message)

@@ -28,7 +28,7 @@ from fleet.heat.effects import arrhenius_rate, life_used, most_drift_m, segment_
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
 from scenarios.live.cell import described_model
-from scenarios.live.recording import SOURCES, Kind, lost_rows, read_card, read_parts
+from scenarios.live.recording import Kind, lost_rows, read_card, read_parts
 from scenarios.run.log import UNITS, joint_values
 from scenarios.run.records import SAME_MOMENT_DIGITS, Offer, ShiftLog
 from scenarios.show.run_page import report_html
@@ -67,7 +67,8 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
     """
     card = read_card(folder)
     epochs = dict.fromkeys(epoch for count in card.senders.values() for epoch in count.epochs)
-    table, log, results, operations = (_of_epoch(read_parts(folder, kind), [*epochs]) for kind in SOURCES)
+    kinds: tuple[Kind, ...] = ("telemetry", "events", "results", "operations")
+    table, log, results, operations = (_of_epoch(read_parts(folder, kind), [*epochs]) for kind in kinds)
     arms = tuple(sorted(set(table["arm"].to_pylist())))
     if not arms:
         raise FleetError(f"'{folder}' holds no state of an arm yet; record longer.")

@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.arm.model import ArmModel
-from fleet.arm.random_motions import RANDOM_MOTIONS_VERSION, random_jobs
+from fleet.arm.plan_cache import RANDOM_MOTIONS_VERSION
 from fleet.difficulty import SETTLING_S, known_temperatures
 from fleet.heat.motor import Motors, friction_heat, magnet_factor, reference_current
 from fleet.heat.thermal import (
@@ -162,6 +161,8 @@ def _log(
     rest_s: float,
     name: str,
 ) -> Recording:
+    from fleet.arm.model import ArmModel
+
     robot, motors, thermal = hardware
     every = round(RATE_HZ / LOG_HZ)
     work, rest = round(work_s * LOG_HZ), round(rest_s * LOG_HZ)
@@ -216,6 +217,8 @@ def simulate_past(scenario: Scenario, arm: PlannedArm, known: HeatModel, *, jobs
 
     A share `OWN` of the jobs is sampled from the scenario's streams.
     """
+    from fleet.arm.random_motions import random_jobs  # loads MuJoCo, which an arm with a fitted network does not need
+
     rng = np.random.default_rng(arm_seed(scenario.spread.seed, arm.index, PAST))
     own = _own_jobs(scenario, arm, round(OWN * jobs), rng)
     other = random_jobs(arm.hardware.robot, jobs - len(own), rng, payload_kg=HEAVY_KG)
@@ -397,6 +400,8 @@ class _Simulator:
         return _Arms(temp, observer.step(estimate, temp[:, WINDING], ambient, 0.0))
 
     def _at_home(self) -> Drive:
+        from fleet.arm.model import ArmModel
+
         robot, motors, _ = self.hardware
         return static_drive(ArmModel(robot).gravity_torque(robot.home_q()), motors)
 

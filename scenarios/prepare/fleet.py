@@ -83,6 +83,7 @@ def prepare(
     cache: str | Path | None = None,
     progress: Progress = quiet,
     like: Fleet | None = None,
+    simulated: bool = True,
 ) -> Fleet:
     """Plan every task type for every arm, and assign each arm its difficulty model; both are cached by content.
 
@@ -91,6 +92,7 @@ def prepare(
         randomise: In addition to what a scenario samples for a shift: ambient temperature, arrivals, fleets.
         training: Which training of the twins, from 0.
         like: Prepared from a scenario with the same arms, cell and task types; its plans and space table are reused.
+        simulated: Whether shifts will be simulated: then the engine is compiled meanwhile.
 
     Raises:
         ScenarioError: no such scenario, no arm can do some work, an arm can do none, arms at home are too close to each
@@ -106,7 +108,16 @@ def prepare(
         every = range(len(spec.arms))
         made = like and like.all[i]
         arms, planned = _arms(
-            spec, every, difficulty, risk, cache, share, every_work=True, training=training, like=made
+            spec,
+            every,
+            difficulty,
+            risk,
+            cache,
+            share,
+            every_work=True,
+            simulated=simulated,
+            training=training,
+            like=made,
         )
         fleets.append(_fleet(spec, arms, planned, _folder(cache), made, share))
     return replace(fleets[0], randomise=randomise, variants=tuple(fleets[1:]))
@@ -164,6 +175,7 @@ def _arms(
     progress: Progress,
     *,
     every_work: bool,
+    simulated: bool = False,
     training: int = 0,
     like: Fleet | None = None,
 ) -> tuple[list[Arm], Sequence[PlannedArm]]:
@@ -171,6 +183,7 @@ def _arms(
 
     Args:
         every_work: Raise if none of the arms can do some work.
+        simulated: Compile the engine meanwhile.
     """
     check_progress(progress)
     if choose("difficulty", difficulty, DifficultyName) == "twin" and not is_shipped(scenario.name):
@@ -188,7 +201,7 @@ def _arms(
         from scenarios.prepare.twins import train_twins, training_seed
         from twin.thermal.thermal_twin import CalibratedTwin
 
-        if every_work:
+        if simulated:
             _compile_meanwhile(scenario, arms, folder)
         twins = train_twins(scenario, planned, folder, progress, seed=training_seed(scenario, training))
         heats = calibrate_networks(scenario, planned, folder, progress, risk=risk)

@@ -18,7 +18,7 @@ from urllib.parse import quote, unquote
 
 import numpy as np
 
-from fleet.arm.random_motions import RANDOM_MOTIONS_VERSION, light_jobs, random_jobs
+from fleet.arm.plan_cache import RANDOM_MOTIONS_VERSION
 from fleet.errors import CheckpointError, FleetError, nearest
 from fleet.files import cache_folder
 from fleet.heat.motor import Motors
@@ -234,6 +234,8 @@ def held_out(scenario: Scenario, arm: PlannedArm, *key: int) -> tuple[tuple[Plan
     Args:
         key: Other spawn keys give other draws.
     """
+    from fleet.arm.random_motions import random_jobs  # loads MuJoCo, which an arm with a trained twin does not need
+
     work = np.random.default_rng(arm_seed(scenario.spread.seed, arm.index, HELD_OUT_WORK, *key))
     robot, wanted = arm.hardware.robot, scenario.twin.exploration
     jobs = list[Plan]()
@@ -249,6 +251,8 @@ def exploration_records(scenario: Scenario, arm: PlannedArm) -> list[Array]:
 
 
 def _cool_exploration(scenario: Scenario, arm: PlannedArm, *draw: int) -> tuple[Plan, ...]:
+    from fleet.arm.random_motions import light_jobs
+
     rng = np.random.default_rng(arm_seed(scenario.spread.seed, arm.index, *draw))
     light = light_jobs(arm.hardware.robot, scenario.twin.exploration, rng)
     return cool_plans(light, arm.hardware, scenario.twin)

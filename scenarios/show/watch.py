@@ -18,6 +18,7 @@ from rich.text import Text
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol.auction import SETTLED, ArmEvent, JobState, Result
+from fleet.bus.protocol.operator import Alarm
 from fleet.bus.router import fleets_at
 from fleet.errors import NoRouter
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetListener, FleetSnapshot, JobScore, describe_status
@@ -39,7 +40,7 @@ COOL_C = 20.0
 """A bar begins at this temperature and is full at the warning limit."""
 HEAT_CELLS, JOB_CELLS = 10, 6
 """Characters of the bars."""
-FRAME, EVENTS = 7, 6
+FRAME, EVENTS = 8, 6
 """Lines of the screen that are neither arms nor events; events shown."""
 WIDE = 120
 """Columns from which the scores of open jobs and the ages of messages are shown."""
@@ -98,13 +99,15 @@ def watch(
         else:
             end = ShiftEnd()
 
-            def ended(fleet: FleetSnapshot) -> bool:
-                return stop.is_set() or bool(end.check(fleet, time.monotonic()))
+            def frames() -> Iterator[FleetSnapshot]:
+                while not stop.is_set():
+                    fleet = listener.view.snapshot(time.monotonic(), jobs=0)
+                    if end.check(fleet, time.monotonic()):
+                        return
+                    listener.serve(time.monotonic() + FRAME_S)
+                    yield fleet
 
-            if out_console.is_terminal:
-                draw(listener, news, ended, joints=joints, end_s=end_s)
-            else:
-                print_lines(listener, news, ended, joints=joints, end_s=end_s)
+            follow(frames(), news, joints=joints, end_s=end_s)
             if end.sentence:
                 say(end.sentence, out_console)
         stop.leave("Stopped watching.")
@@ -159,26 +162,46 @@ class ShiftEnd:
         return self.sentence
 
 
-def draw(
-    listener: FleetListener,
-    news: deque[str],
-    ended: Callable[[FleetSnapshot], bool],
-    *,
-    joints: bool,
-    end_s: float | None,
-) -> None:
-    """Draw a screen that fills the terminal, again and again until the end or the key q."""
-    bars = JobBars()
-    with pressed_keys() as pressed, Live(console=out_console, screen=True, auto_refresh=False) as live:
-        while not ended(fleet := listener.view.snapshot(time.monotonic(), jobs=0)):
-            listener.serve(time.monotonic() + FRAME_S)
-            keys = pressed()
-            if "q" in keys:
-                break
-            joints ^= keys.count("j") % 2 == 1
-            size = out_console.size
-            how = {"width": size.width, "joints": joints, "done": bars.update(fleet), "end_s": end_s}
-            live.update(screen(fleet, list(news), size.height, **how), refresh=True)
+def follow(frames: Iterator[FleetSnapshot], news: deque[str], *, joints: bool, end_s: float | None) -> None:
+    """Show a fleet until the frames end: on a terminal as a screen, until the key q; else as lines.
+
+    Without a terminal, news are printed as they come, and a line about every arm from time to time.
+    """
+    bars, due_s = JobBars(), time.monotonic() + SNAPSHOT_S
+    with ExitStack() as resources:
+        live, pressed = None, no_keys
+        if out_console.is_terminal:
+            pressed = resources.enter_context(pressed_keys())
+            live = resources.enter_context(Live(console=out_console, screen=True, auto_refresh=False))
+        for fleet in frames:
+            if live is not None:
+                keys = pressed()
+                if "q" in keys:
+                    break
+                joints ^= keys.count("j") % 2 == 1
+                size = out_console.size
+                how = {"width": size.width, "joints": joints, "done": bars.update(fleet), "end_s": end_s}
+                live.update(screen(fleet, list(news), size.height, **how), refresh=True)
+                continue
+            while news:
+                echo(news.popleft())
+            if time.monotonic() >= due_s:
+                due_s = time.monotonic() + LINE_S
+                for line in plain_lines(fleet, joints, end_s):
+                    echo(line)
+
+
+def plain_lines(fleet: FleetSnapshot, joints: bool, end_s: float | None) -> Iterator[str]:
+    """Lines about a fleet; arguments as of `watch`."""
+    yield from (arm_line(arm, joints=joints) for arm in fleet.arms)
+    yield from (line.plain for line in (jobs_line(fleet), space_line(fleet), alarm_line(fleet)))
+    if end_s is not None:
+        yield time_line(fleet, end_s).plain
+
+
+def no_keys() -> str:
+    """The keys of a program without a keyboard."""
+    return ""
 
 
 @contextmanager
@@ -189,12 +212,12 @@ def pressed_keys() -> Iterator[Callable[[], str]]:
         import tty
 
     except ModuleNotFoundError:  # Windows
-        yield lambda: ""
+        yield no_keys
         return
     try:
         before = termios.tcgetattr(sys.stdin.fileno())
     except (OSError, ValueError, termios.error):  # no terminal, or closed
-        yield lambda: ""
+        yield no_keys
         return
 
     def pressed() -> str:
@@ -210,36 +233,16 @@ def pressed_keys() -> Iterator[Callable[[], str]]:
         termios.tcsetattr(sys.stdin.fileno(), termios.TCSADRAIN, before)
 
 
-def print_lines(
-    listener: FleetListener,
-    news: deque[str],
-    ended: Callable[[FleetSnapshot], bool],
-    *,
-    joints: bool,
-    end_s: float | None,
-) -> None:
-    """Print news as they come, and a line about every arm from time to time, until the end."""
-    due_s = time.monotonic() + SNAPSHOT_S
-    while not ended(fleet := listener.view.snapshot(time.monotonic(), jobs=0)):
-        listener.serve(time.monotonic() + FRAME_S)
-        while news:
-            echo(news.popleft())
-        if time.monotonic() >= due_s:
-            due_s = time.monotonic() + LINE_S
-            for arm in fleet.arms:
-                echo(arm_line(arm, joints=joints))
-            echo(jobs_line(fleet).plain)
-            echo(space_line(fleet).plain)
-            if end_s is not None:
-                echo(time_line(fleet, end_s).plain)
-
-
 def describe(name: str, message: msgspec.Struct) -> str:
     """Line about an event or a result; "" for other messages."""
     if isinstance(message, ArmEvent):
         return f"{format_time(message.time_s)}  {name} {plain_event(message)}"
     if isinstance(message, Result):
         return f"{format_time(message.time_s)}  job {describe_status(message.status)}"
+    if isinstance(message, Alarm):
+        seen = f"{message.by} has seen the alarm" if message.by else ""
+        change = "alarm has ended" if message.ended_s is not None else seen or "alarm"
+        return f"{format_time(message.time_s)}  {change}: {message.what}"
     return ""
 
 
@@ -290,7 +293,7 @@ def screen(
     parts.append(joint_table(arms) if joints else arm_table(arms, done, wide=width >= WIDE))
     if len(arms) < len(fleet.arms):
         parts.append(Text(f"… and {len(fleet.arms) - len(arms)} more with more headroom", style="dim"))
-    parts += [jobs_line(fleet), space_line(fleet)]
+    parts += [jobs_line(fleet), space_line(fleet), alarm_line(fleet)]
     return Group(*parts, *(_line((text, "dim")) for text in (*events, KEYS)))
 
 
@@ -412,6 +415,14 @@ def space_line(fleet: FleetSnapshot) -> Text:
         where = "not present" if arm is None or not arm.present else "away from home" if arm.away else "has a job"
         parts.append(f"{name} ({where}{', may be anywhere' if ANYWHERE in spaces else ''})")
     return _line(f"space closed by: {', '.join(parts) or 'none'}")
+
+
+def alarm_line(fleet: FleetSnapshot) -> Text:
+    """Number of alarms that last, and the last one that nobody has seen, of those that a gateway raises."""
+    lasting = [alarm for alarm in fleet.alarms if alarm.ended_s is None]
+    unseen = [alarm for alarm in fleet.alarms if not alarm.by]
+    last = f", not seen: {len(unseen)}, the last: {unseen[-1].what}" if unseen else ""
+    return _line((f"alarms: {len(lasting) or 'none'}{last}", "bold red" if unseen else ""))
 
 
 def arm_line(arm: ArmSnapshot, *, joints: bool = False) -> str:

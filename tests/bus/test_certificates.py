@@ -34,7 +34,7 @@ from fleet.errors import BusError
 
 DOCS = (Path(__file__).parents[2] / "docs" / "security.md").read_text(encoding="utf-8")
 ROSTER_ARMS = ("arm_0", "arm_1", "arm 2+*@", "arm_10")
-NAMES = {"auction": ("auctioneer", "other"), "policy": ("mine", "other")}
+NAMES = {"auction": ("auctioneer", "other"), "policy": ("mine", "other"), "monitor": ("operator", "other")}
 EVERY_KEY = [
     str(keys.ParsedKey("f", role, name, topic, asker))
     for role, topics in TOPICS.items()
@@ -96,6 +96,7 @@ def test_arms_without_an_auctioneer_answer_outsiders_and_nobody_else_does():
         owner = participant.role == "arm" and (
             place.role in NAMELESS or (place.role, place.name) == ("arm", participant.name)
         )
+        owner |= (participant.role, place.role, place.name) == ("operator", "monitor", "operator")
         for message in ("reply", "declare_queryable", "put"):
             assert allowed(rules, participant.common_name, "ingress", message, key) == owner, (participant, key)
 

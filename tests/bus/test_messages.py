@@ -515,7 +515,7 @@ def test_the_participants_publish_and_answer_as_the_contract_says(nodes, role):
 
 @pytest.mark.parametrize("channel", CHANNELS, ids=lambda channel: channel.name)
 def test_a_key_is_used_as_the_registry_says_or_not_at_all(channel):
-    key = channel.address.format(fleet="f", arm="a", auctioneer="a", policy="a", peer="b")
+    key = channel.address.format(fleet="f", arm="a", auctioneer="a", policy="a", monitor="a", peer="b")
     assert channel_of(key) is channel
     parsed = keys.parse(key)
     assert (parsed.role, parsed.topic) == (channel.role, channel.topic)

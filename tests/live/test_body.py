@@ -301,16 +301,24 @@ def test_a_change_of_step_changes_no_event(small):
     np.testing.assert_allclose(steady.truth.temp_c, changed.truth.temp_c, atol=0.01)
 
 
-def test_no_step_is_longer_than_the_limit(small):
-    arm, _, _ = one_job(small)
+def test_no_step_is_longer_than_the_limit_except_of_an_idle_arm(small):
+    """One long step of an arm at rest ends as many short ones do."""
+    arm, job, plan = one_job(small, repetitions=5000)
     body = SimulatedBody(
         arm, LIMITS, lambda time_s: 25.0, dt_s=60.0, max_dt_s=10.0, rng=np.random.default_rng(0), warm=False
     )
     body.advance(10.0)
     assert body.time_s == 10.0
-    body.set_step(100.0)
-    body.advance(20.0)
-    assert body.time_s == 20.0
+    body.set_step(30.0)
+    body.advance(39.0)
+    assert body.time_s == 10.0
+    body.advance(40.0)
+    steps = body_of(arm, dt_s=1.0, limits=LIMITS, warm=False)
+    steps.advance(40.0)
+    np.testing.assert_allclose(body.truth.temp_c, steps.truth.temp_c, atol=1e-3)
+    body.start(job, plan, 0)
+    body.advance(50.0)
+    assert body.time_s == 50.0
 
 
 def test_a_body_measures_the_heat_of_its_job_once_the_cycles_have_begun(small):

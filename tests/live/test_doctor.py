@@ -160,12 +160,17 @@ def test_an_arm_that_left_earlier_is_missing_only_if_expected():
 
 def test_a_warning_is_no_fault():
     hot = arm(mode="faulted", hottest_c=76.0, joint=2)
-    counts = {"unfinished": 1, "given_up": 2}
-    output, found = faults(fleet(hot, counts=counts), ClockProbe(100.0, 100.4, 5000.0, 60.0), overrun=5)
+    jobs = (JobStatus("x", "unfinished"), JobStatus("y", "given_up", reason="two faults"), JobStatus("z", "finished"))
+    now = msgspec.structs.replace(fleet(hot, arm(arm="b", break_end_s=900.0)), jobs=jobs)
+    output, found = faults(now, ClockProbe(100.0, 100.4, 5000.0, 60.0), overrun=5)
     assert output == []
     warned = " ".join(finding.what for finding in found.findings)
-    for word in ("joint 2 is at 76.0", "400 ms", "5 message(s)", "1 job(s) are unfinished", "2 job(s) are abandoned"):
+    for word in ("joint 2 is at 76.0", "400 ms", "5 message(s)", "'x' is unfinished", "'y' is abandoned: two"):
         assert word in warned
+    assert "'z'" not in warned
+    assert [each.what for each in found.findings if each.level == "note"] == [
+        "b is in a break until 900 s of fleet time."
+    ]
 
 
 @given(

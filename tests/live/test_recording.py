@@ -28,14 +28,14 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
 from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Operation, Pause, Settle
+from fleet.bus.protocol.operator import Alarm, Cancel, Change, ControlRequest, Operation, Pause, Settle
 from fleet.bus.router import Router
 from fleet.errors import FleetError
 from fleet.events import Event
 from fleet.robot import ThermalLimits
 from scenarios.cli.main import main
 from scenarios.live.recorder import Recorder, lock_folder, record
-from scenarios.live.recording import CARD, open_messages, part_files, read_card, read_parts, replay
+from scenarios.live.recording import CARD, alarms_of, open_messages, part_files, read_card, read_parts, replay
 from scenarios.live.recording_report import heat_use, open_recording, order_events
 from scenarios.run.records import ShiftLog, schedule
 from scenarios.show.run_page import report_html
@@ -648,3 +648,15 @@ def test_kills_cost_no_result(tmp_path, seed):
     assert set(recorded) | missing >= set(sent[:-1])  # its last one may never have left the publisher
     assert set(recorded).isdisjoint(missing)
     assert len(missing) <= len(sent) / 100
+
+
+def test_alarms_are_kept_once_in_order_also_of_a_gateway_that_starts_again(tmp_path):
+    assert alarms_of(tmp_path) == []
+    recorder = Recorder.open(tmp_path, "f")
+    began = Alarm("gateway", 1, 5.0, "7d1f", "fault", "a is faulted.", "a", 5.0)
+    seen = replace(began, number=2, time_s=6.0, by="ann", acknowledged="2026-01-31T09:00:00Z")
+    again = Alarm("gateway", 1, 9.0, "8e2a", "sensor", "b has impossible temperatures.", "b", 9.0)
+    for alarm in (began, seen, seen, again, began):  # repeated ones are those that the next gateway publishes again
+        recorder.add("gateway", alarm)
+    recorder.write()
+    assert alarms_of(tmp_path) == list(open_messages(tmp_path)) == [began, seen, again]

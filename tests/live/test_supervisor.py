@@ -208,3 +208,47 @@ threading.Event().wait(60)
     while not exited(child) and time.monotonic() < deadline_s:
         threading.Event().wait(0.02)
     assert exited(child)
+
+
+FORKS = """
+import os, signal, sys
+from pathlib import Path
+from fleet.live.supervisor import Backoff, Part, Supervisor, exit_with_supervisor, share_memory
+BALLAST = [object() for _ in range(100_000)]
+def main(words):
+    exit_with_supervisor()
+    print("ready", *words, os.environ["GIVEN"], len(BALLAST), os.getsid(0) == os.getpid(), flush=True)
+    if words == ["exits"]:
+        sys.exit(3)
+    signal.pause()
+share_memory()
+print("not written twice", end="")
+with Supervisor(Path({folder!r}), program=("own",), main=lambda words: main(list(words))) as supervisor:
+    for name, argv in (("a", ("own", "stays")), ("b", ("own", "exits")), ("c", (sys.executable, "-c", {wait!r}))):
+        supervisor.start(Part(name=name, argv=argv, env={{"GIVEN": name}}), ready_s=60)
+    supervisor.run(lambda: supervisor.restarts()["b"] > 0 and supervisor.ready("b"), poll_s=0.05)
+    rollup = Path(f"/proc/{{supervisor.pid('a')}}/smaps_rollup").read_text().splitlines()
+    sizes_kb = [line.split()[1] for line in rollup if line.startswith(("Rss", "Pss:"))]
+    print("\\n", supervisor.pid("a"), *sizes_kb, flush=True)
+    {end}
+"""
+"""Three processes: a fork that stays, one that exits with code 3 and is restarted, and an executed program."""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks are for Linux")
+@pytest.mark.parametrize(("end", "code"), [("", 0), ("os.kill(os.getpid(), signal.SIGKILL)", -9)])
+def test_command_lines_of_the_program_are_forks_that_share_its_memory(tmp_path, end, code):
+    import subprocess
+
+    script = FORKS.format(folder=str(tmp_path), wait=WAIT, end=end)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=PATIENCE_S)
+    assert (done.returncode, done.stdout.count("not written twice")) == (code, 1), done.stderr
+    child, rss_kb, pss_kb = map(int, done.stdout.splitlines()[-1].split())
+    assert pss_kb < 0.7 * rss_kb
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not exited(child) and time.monotonic() < deadline_s:
+        threading.Event().wait(0.02)
+    assert exited(child)
+    assert (tmp_path / "a.log").read_text() == "ready stays a 100000 True\n"
+    assert (tmp_path / "b.log").read_text().count("ready exits b 100000 True\n") >= 2
+    assert "'b' exited with code 3" in done.stderr

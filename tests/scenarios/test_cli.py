@@ -356,7 +356,7 @@ def test_the_shell_completes_commands_and_their_options(words, completions):
 
 def test_a_warning_is_one_line_where_there_is_no_terminal():
     warn = "logging.getLogger('fleet.live').warning('%s', 'word ' * 60)"
-    code = f"import logging, scenarios.cli.main as cli; cli.app = lambda **_: {warn}; cli.main([])"
+    code = f"import logging, scenarios.cli.main as cli; cli._command = lambda: lambda *_, **__: {warn}; cli.main([])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)
     assert done.stderr == f"WARNING  fleet.live: {'word ' * 60}\n"
 

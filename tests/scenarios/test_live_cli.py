@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -390,6 +391,18 @@ def test_a_shift_is_not_continued_with_the_other_kind_of_allocation(thermofleet,
     code, _, err = thermofleet(*words.split(), tmp_path)
     assert code == 2
     assert complaint in " ".join(err.split())
+
+
+def test_up_refuses_a_port_in_use_before_it_plans(thermofleet, tmp_path):
+    with socket.socket() as held:
+        held.bind(("127.0.0.1", 0))
+        held.listen()
+        port = held.getsockname()[1]
+        code, _, err = thermofleet("up", "scale_64", "--port", port, "--out", tmp_path)  # it would plan for minutes
+    assert code == 2
+    assert f"Port {port} of 127.0.0.1 cannot be used (Address already in use). Give another --port" in " ".join(
+        err.split()
+    )
 
 
 def test_a_shift_is_continued_with_its_own_kind_of_allocation(tmp_path):

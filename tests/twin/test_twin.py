@@ -149,15 +149,18 @@ def drawn(seed, *shape):
 
 
 @examples(30)
+@pytest.mark.parametrize("jit_off", ["0", "1"], ids=["compiled", "in NumPy"])
 @given(config=configs, count=st.integers(1, 7), joints=st.integers(1, 3), batch=st.integers(1, 28))
-def test_windows_of_an_arm_go_through_each_network_alone(config, count, joints, batch):
+def test_windows_of_an_arm_go_through_each_network_alone(config, count, joints, batch, jit_off):
     """`joints` of each network: 1 with a network per joint, all of the arm with one network."""
     nets, z = several(count, config, 3 * joints), drawn(batch, batch, config.window, count * joints, 3)
     apart = torch.from_numpy(z).reshape(batch, config.window, count, 3 * joints)
     with torch.inference_mode():
         outputs = [net(apart[:, :, n], torch.zeros(batch, config.latent)) for n, net in enumerate(nets)]
     want = np.stack([x_hat.numpy() for x_hat, _, _ in outputs], axis=2).reshape(z.shape)
-    networks = Networks([weights_of(net) for net in nets])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("NUMBA_DISABLE_JIT", jit_off)
+        networks = Networks([weights_of(net) for net in nets])
     got = networks.reconstruct(z)[0]
     assert (got.shape, got.dtype) == (z.shape, np.float32)
     np.testing.assert_allclose(got, want, atol=2e-6)

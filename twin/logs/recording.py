@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
 
 from fleet import readings
 from fleet.errors import FleetError, IdentificationError
@@ -200,6 +199,8 @@ def at_rate(time_s: Array, values: Array, rate_hz: float) -> tuple[Array, Array]
     Returns:
         Times of the new samples, s, [sample], and their values, [sample, ...]; see `stretches`.
     """
+    from scipy.interpolate import make_interp_spline  # slow to import, and a live arm needs none of these
+
     since_s = time_s - time_s[0]
     line = make_interp_spline(since_s, values, k=1)
     samples = int(since_s[-1] * rate_hz + _SAME_RATE * len(time_s))

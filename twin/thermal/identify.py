@@ -19,7 +19,6 @@ from typing import Any
 import msgspec
 import networkx as nx
 import numpy as np
-from scipy.optimize import least_squares
 
 from fleet.errors import IdentificationError
 from fleet.heat.motor import Motors, copper_loss, gen3_motors, magnet_factor, thermal_data
@@ -550,6 +549,8 @@ def usual_noise(logs: Sequence[HeatLog]) -> Noise:
 
 def solve(problem: Problem, x: Array) -> Array:
     """The most probable logarithms, [parameter], from a first guess."""
+    from scipy.optimize import least_squares
+
     jacobian: Any = problem.jacobian  # scipy-stubs accept only the names of SciPy's own difference schemes.
     sd = problem.vector.sd
     return least_squares(problem.residual, x, jacobian, x_scale=sd, ftol=1e-6, xtol=1e-5, max_nfev=60).x

@@ -12,7 +12,6 @@ from itertools import repeat
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import ndtr
 
 from fleet.difficulty import KNOWN, SETTLING_S, Difficulty, Forecast, difficulty_of_error
 from fleet.errors import FleetError
@@ -173,6 +172,8 @@ def fit_curve(predicted_c: Array, peak_c: Array, limit_c: float) -> PeakCurve:
     Raises:
         NotEnoughExperience: too few jobs.
     """
+    from scipy.special import ndtr
+
     if len(peak_c) < LEAST_JOBS:
         raise NotEnoughExperience(f"P(saturation) needs {LEAST_JOBS} past jobs, better 200 (got {len(peak_c)}).")
     distance_k = np.abs(predicted_c - limit_c)

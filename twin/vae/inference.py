@@ -77,6 +77,20 @@ def forward(gates: Array, driven: Array, before: Array, after: Array, states: Ar
             states[n, skip + k] = leave * tanh(cell)
 
 
+def forward_uncompiled(
+    gates: Array, driven: Array, before: Array, after: Array, states: Array, skip: int, _order: Array
+) -> None:
+    """As `forward`, in NumPy: for a process whose few scores are not worth the memory of numba, 80 MB."""
+    gates += driven
+    m = before.shape[1]
+    enter, keep, new, leave = (gates[:, first : first + m] for first in range(0, 4 * m, m))
+    for gate in (enter, keep, leave):
+        gate[:] = _HALF + _HALF * np.tanh(_HALF * gate)
+    np.tanh(new, out=new)
+    after[:] = keep * before + enter * new
+    np.multiply(leave, np.tanh(after), out=states[:, skip:])
+
+
 @kernel
 @fused
 def backward(
@@ -161,7 +175,8 @@ class Networks:
 
     def __init__(self, nets: Sequence[Weights]) -> None:
         self._nets, self.count = nets, len(nets)
-        self._advance, self._order = forward.chosen(), np.arange(len(nets))
+        chosen, self._order = forward.chosen(), np.arange(len(nets))
+        self._advance = forward_uncompiled if chosen is forward.interpreted else chosen
         self.encoder, self.decoder = self._lstm("encoder"), self._lstm("decoder")
         self.summary, self.mu, self.expand, self.out = map(self._linear, ("summary", "mu", "expand", "out"))
         self.logvar = self._linear("logvar") if "logvar.weight" in nets[0] else None

@@ -1,8 +1,9 @@
 """Keys of the bus and what travels under each: one table, and the functions that build and parse keys.
 
-`thermofleet/v4/{fleet}/…` with `arm/{arm}/{topic}`, `auction/{auctioneer}/{topic}`, `jobs/{topic}`, `clock/now` and
-`policy/{policy}/act`. An arm queries an auctioneer under `auction/{auctioneer}/{topic}/{arm}`, and another arm under
-`arm/{other}/{topic}/{arm}`: access control sees only keys, so the querier must be part of the key.
+`thermofleet/v4/{fleet}/…` with `arm/{arm}/{topic}`, `auction/{auctioneer}/{topic}`, `jobs/{topic}`, `clock/now`,
+`policy/{policy}/act` and `monitor/{monitor}/alarm`. An arm queries an auctioneer under
+`auction/{auctioneer}/{topic}/{arm}`, and another arm under `arm/{other}/{topic}/{arm}`: access control sees only keys,
+so the querier must be part of the key.
 
 `fleet.bus.client` publishes, subscribes, queries and replies by the table alone; docs/bus/messages.md and docs/contract
 are generated from it. Names of fleets, arms and auctioneers are percent-encoded to one chunk, so no name can contain a
@@ -21,7 +22,7 @@ import msgspec
 from fleet.bus.protocol import auction, cell, consensus, messages, operator, policy
 from fleet.errors import NAME_RULE, is_name, printable
 
-Role = Literal["arm", "auction", "jobs", "clock", "policy"]
+Role = Literal["arm", "auction", "jobs", "clock", "policy", "monitor"]
 MessageType = type[msgspec.Struct]
 Pattern = Literal["token", "publish", "query"]
 Priority = Literal["REAL_TIME", "INTERACTIVE_HIGH", "INTERACTIVE_LOW", "DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND"]
@@ -68,9 +69,9 @@ class BusChannel:
     priority: Priority = "DATA"
 
     @property
-    def sender(self) -> Literal["arm", "auctioneer", "policy"]:
+    def sender(self) -> Literal["arm", "auctioneer", "policy", "monitor"]:
         """Role that publishes, replies or declares the token."""
-        return self.role if self.role in ("arm", "policy") else "auctioneer"
+        return self.role if self.role in ("arm", "policy", "monitor") else "auctioneer"
 
     @property
     def names_querier(self) -> bool:
@@ -91,7 +92,7 @@ class BusChannel:
     @property
     def address(self) -> str:
         """The key with its parameters in braces."""
-        owner = {"arm": "/{arm}", "auction": "/{auctioneer}", "policy": "/{policy}"}.get(self.role, "")
+        owner = "" if self.role in NAMELESS else f"/{{{self.sender}}}"
         querier = "" if not self.names_querier else "/{peer}" if self.role == "arm" else "/{arm}"
         return f"{PREFIX}/{{fleet}}/{self.role}{owner}/{self.topic}{querier}"
 
@@ -130,6 +131,7 @@ CHANNELS: tuple[BusChannel, ...] = (
     BusChannel("jobs", "cell", "query", cell.CellRequest, cell.Cell),
     BusChannel("clock", "now", "query", auction.ClockRequest, auction.Clock),
     BusChannel("policy", "act", "query", policy.ActRequest, policy.ActReply, receiver="auctioneer, or simulated shift"),
+    BusChannel("monitor", "alarm", "publish", operator.Alarm, history=HISTORY),
 )
 CHANNEL: Mapping[tuple[str, str], BusChannel] = {(channel.role, channel.topic): channel for channel in CHANNELS}
 """By role and topic."""
@@ -149,7 +151,7 @@ STATES = f"{PREFIX}/*/arm/*/state"
 MAX_CACHED, MAX_CACHED_CHARACTERS = 4096, 256
 """Parsed keys that are cached, and characters of the longest of them."""
 _KEY = re.compile(
-    rf"{PREFIX}/(?P<fleet>[^/]*)/((?P<nameless>jobs|clock)|(?P<role>arm|auction|policy)/(?P<name>[^/]*))"
+    rf"{PREFIX}/(?P<fleet>[^/]*)/((?P<nameless>jobs|clock)|(?P<role>arm|auction|policy|monitor)/(?P<name>[^/]*))"
     r"/(?P<topic>[^/]*)(/(?P<asker>[^/]*))?"
 )
 
@@ -161,7 +163,7 @@ class ParsedKey:
     fleet: str
     role: Role
     name: str
-    """Of the arm, the auctioneer or the policy; "" for jobs and clock."""
+    """Of the arm, the auctioneer, the policy or the monitor; "" for jobs and clock."""
     topic: str
     asker: str = ""
     """The querying arm, for the topics in `ASKED`; "" for all others."""

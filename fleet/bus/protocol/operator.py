@@ -135,3 +135,31 @@ class Operation(FiniteStruct, frozen=True):
     """As in `Clock`: `number` restarts with a new epoch."""
     awards: Annotated[tuple[Name, ...], msgspec.Meta(max_length=16)] = ()
     """With `redo`, without an auctioneer: the awards of the job whose last cycle was not done."""
+
+
+class Alarm(FiniteStruct, frozen=True):
+    """Published under `monitor/{monitor}/alarm`: an alarm began, ended, or was acknowledged. The last message of an
+    alarm has its state."""
+
+    monitor: Name
+    """Who raised it, for example a gateway."""
+    number: Count
+    """Counts the messages of this monitor since its start."""
+    time_s: Number
+    """Fleet time of this change."""
+    alarm: Name
+    """Unique name of the alarm."""
+    kind: Name
+    """What is wrong, for example `fault`, `sensor`, `given_up` or `no_progress`."""
+    what: str
+    """A sentence."""
+    subject: str = ""
+    """Arm or job; "" for the fleet."""
+    began_s: Number = 0.0
+    """Fleet time at which it began."""
+    ended_s: Number | None = None
+    """Fleet time at which it ended; null while it lasts."""
+    by: Person = ""
+    """Who has acknowledged it; "" while nobody has."""
+    acknowledged: str = ""
+    """When, as `2026-01-31T09:00:00Z`; "" while nobody has."""

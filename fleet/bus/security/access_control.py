@@ -163,7 +163,7 @@ def rights(fleet: str, participant: RosterEntry, *, by_consensus: bool = False) 
             return Rights((own, *outsiders), (quotes, awards, history, time, status, policies))
         case "operator":
             steer = keys.of_jobs(fleet, "clear"), keys.of_jobs(fleet, "control"), keys.of_every_arm(fleet, "reset")
-            return Rights(queries=(submit, *steer, *looks))
+            return Rights((keys.all_of(fleet, "monitor", participant.name),), (submit, *steer, *looks))
         case "submitter":
             return Rights(queries=(submit, *looks))
         case "monitor" | "recorder":

@@ -345,7 +345,7 @@ class SimulatedBody:
         arm: True parameters of the arm; its plans and its model are not used.
         ambient_c: Ambient temperature at the arm, °C, by fleet time.
         dt_s: Length of a step, fleet seconds.
-        max_dt_s: Upper limit of the length of a step.
+        max_dt_s: Upper limit of the length of a step; an idle arm has none, as its constant heat is integrated exactly.
         time_s: Fleet time at the start.
         warm: Whether it has been powered at home for hours; else all is at ambient temperature.
     """
@@ -467,6 +467,7 @@ class SimulatedBody:
         if not 0 <= cycles < job.repetitions:
             raise ValueError(f"cycles must be 0 to {job.repetitions - 1} for '{job.name}' (got {cycles}).")
         self._task, self._plan = _Current(job, plan, cycles, allowed=cycles), plan
+        self.set_step(self._dt_s)  # an idle arm may have had a longer one
         self._world, self._plant = self._build_world(self._task)
         self._state = self._carried(self._world)
 
@@ -493,7 +494,9 @@ class SimulatedBody:
     def set_step(self, dt_s: float) -> None:
         if not dt_s > 0:
             raise ValueError(f"The step of a body must be > 0 s (got {dt_s}).")
-        time_s, before_s, dt_s = self.time_s, float(self._state.tick[0]) * self._dt_s, min(dt_s, self._max_dt_s)
+        time_s, before_s = self.time_s, float(self._state.tick[0]) * self._dt_s
+        if not (self.is_free and self.away is None):
+            dt_s = min(dt_s, self._max_dt_s)
         ticks = int(before_s / dt_s + ROUNDING_S)
         # The engine counts its time in ticks of the new length, of which as many have passed.
         later_s = ticks * dt_s - before_s

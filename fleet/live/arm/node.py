@@ -69,7 +69,7 @@ class ArmConfig:
     warning_c: float
     """Motor temperature above which it accepts no work."""
     rate_hz: float = STATE_HZ
-    """State messages per real second."""
+    """State messages per real second while it works; an idle arm publishes one in `IDLE_PERIOD_S`."""
     boot: int = 1
     """Number of this start."""
     ambient_c: Callable[[float], float] = lambda time_s: 25.0
@@ -395,6 +395,10 @@ WRITE_RETRY_S = 1.0
 """Real seconds between two attempts to write records for which the disk had no space."""
 
 
+IDLE_PERIOD_S = 0.5
+"""Real seconds between two states of an idle arm: a fraction of `FRESH_S`, after which it counts as offline."""
+
+
 class ArmNode:
     """One arm of a fleet.
 
@@ -429,6 +433,7 @@ class ArmNode:
         self._reading = body.read_sensors()
         self._break: Break | None = None
         self._quoted_s = -math.inf
+        self._idle: bool = False
         self._state_due_s = self._retry_s = -math.inf
         """Real seconds at which the next state message and the next attempt to write are due."""
         self._warn = RateLimitedWarnings(self._name)
@@ -590,6 +595,7 @@ class ArmNode:
         if real_s >= self._retry_s:
             self._retry_s = real_s + WRITE_RETRY_S
             self.executor.retry_writes()
+        self._set_pace(real_s)
         self._advance_body(real_s)
         self._keep_breaks()
         self.executor.return_ended(self._body.time_s, real_s, at_home=self._body.away is None)
@@ -599,8 +605,23 @@ class ArmNode:
             self.work_source.send_report(auctioneer, report)
         self.work_source.step(real_s)
         if real_s >= self._state_due_s:
-            self._state_due_s = next_due_s(self._state_due_s, real_s, 1.0 / self._config.rate_hz)
+            self._state_due_s = next_due_s(self._state_due_s, real_s, self._period_s)
             self._send_state()
+
+    @property
+    def _period_s(self) -> float:
+        """Real seconds between two states, and between two steps of the body."""
+        return max(1.0 / self._config.rate_hz, IDLE_PERIOD_S if self._idle else 0.0)
+
+    def _set_pace(self, real_s: float) -> None:
+        """Step the body and publish its state less often while an arm that takes jobs has none and is at home."""
+        at_home = self._body.is_free and self._body.away is None
+        idle = at_home and not self.executor.active and self._config.takes_jobs
+        if idle != self._idle:
+            self._idle, self._state_due_s = idle, real_s
+            self._body.set_step(self._period_s * self.clock.speed)
+            for event in self._body.advance(self.clock.now_s(real_s)):  # a job does not begin before its award
+                self._handle_event(event, real_s)
 
     def _keep_breaks(self) -> None:
         """Begin and end breaks; in some the arm ends the cycle and returns its jobs."""
@@ -749,7 +770,7 @@ class ArmNode:
         """Use another clock; with `jump` it reads another time now, and the body is set to that time."""
         if clock.speed != self.clock.speed:
             self._warn("speed", f"runs at the fleet's speed of {clock.speed:g}, not at {self.clock.speed:g}.")
-            self._body.set_step(clock.speed / self._config.rate_hz)
+            self._body.set_step(clock.speed * self._period_s)
         self.clock = clock
         if jump:
             self._body.set_time(clock.now_s(time.monotonic()))

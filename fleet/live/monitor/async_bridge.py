@@ -10,19 +10,24 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from itertools import takewhile
 from typing import Self, TypeVar
 
 import msgspec
+from msgspec.structs import replace
 
 from fleet.bus.client import BusClient, Replies, replier
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Quote, QuoteRequest
 from fleet.bus.protocol.messages import encode
+from fleet.bus.protocol.operator import Alarm
 from fleet.errors import BusError, Refused
-from fleet.live.monitor.snapshot import MAX_JOBS, FleetListener, FleetSnapshot, Recent, Role
+from fleet.live.monitor.alarms import AlarmList
+from fleet.live.monitor.health import check_fleet
+from fleet.live.monitor.snapshot import FRESH_S, MAX_JOBS, FleetListener, FleetSnapshot, Recent, Role
 
 _LOG = logging.getLogger(__name__)
 
@@ -31,6 +36,10 @@ Result = TypeVar("Result")
 REPLY_S, QUOTE_S, TURN_S = 5.0, 1.0, 0.2
 """Real seconds: for the auctioneer to reply; for all arms to quote; between two checks whether to stop."""
 
+CHECK_S = 1.0
+"""Real seconds between two checks for alarms."""
+MONITOR = "gateway"
+"""Name under which alarms are published without a certificate, whose name would be used."""
 HISTORY = 1024
 """Events and results that are kept for slow readers, and for those that reconnect."""
 MAX_NAMES = 4096
@@ -96,8 +105,21 @@ class AsyncBridge:
         feed: Numbered messages; used on the event loop only.
     """
 
-    def __init__(self, link: BusClient, on_message: Callable[[], None]) -> None:
-        """Prepare; `link` is open, and `on_message` is called for every message in `feed`, on the event loop."""
+    def __init__(
+        self,
+        link: BusClient,
+        on_message: Callable[[], None],
+        *,
+        kept: Iterable[Alarm] = (),
+        on_alarm: Callable[[Alarm], None] = lambda alarm: None,
+    ) -> None:
+        """Prepare; `link` is open.
+
+        Args:
+            on_message: Called for every message in `feed`, on the event loop.
+            kept: Alarms of a recording, which are published again.
+            on_alarm: Called for every change of an alarm, on the event loop.
+        """
         self.feed = EventFeed()
         self.fleet = link.fleet
         self._link, self._on_message = link, on_message
@@ -105,6 +127,13 @@ class AsyncBridge:
         self._thread = threading.Thread(target=self._serve, name="bus", daemon=True)
         self._listener = FleetListener(link, on_message=self._message, on_presence=self._presence)
         self._loop: asyncio.AbstractEventLoop | None = None
+        name = link.participant or MONITOR
+        self._alarms, self._on_alarm = AlarmList(name, kept), on_alarm
+        self._publish = link.publisher(keys.build(self.fleet, "monitor", "alarm", name), Alarm)
+        self._check_s = time.monotonic() + FRESH_S  # by then it has heard from everybody who is there
+        self._earlier = deque[FleetSnapshot](maxlen=3)
+        for alarm in self._alarms.alarms.values():
+            self._tell(replace(alarm, monitor=name))
 
     async def __aenter__(self) -> Self:
         self._loop = asyncio.get_running_loop()
@@ -132,6 +161,23 @@ class AsyncBridge:
             return replies.first(key)
         except Refused as error:
             raise Refused(f"The {replier(key)} refused: {error}") from error
+
+    async def acknowledge(self, alarm: str, by: str) -> Alarm:
+        """Note that a person has seen an alarm. Raises Refused as `AlarmList.acknowledge`."""
+
+        def acknowledge(done: Callable[[Alarm | Refused], None]) -> None:
+            try:
+                changed = self._alarms.acknowledge(alarm, by, self._time_s(), datetime.now(UTC))
+            except Refused as refused:
+                done(refused)
+            else:
+                self._change(changed)
+                done(changed)
+
+        answer = await self._on_bus(acknowledge)
+        if isinstance(answer, Refused):
+            raise answer
+        return answer
 
     async def quotes(self, request: QuoteRequest) -> Quotes:
         """Request quotes of every arm. Raises BusError if the certificate does not permit it."""
@@ -167,6 +213,31 @@ class AsyncBridge:
     def _serve(self) -> None:
         while not self._stop.is_set():
             self._listener.serve(time.monotonic() + TURN_S)
+            if (real_s := time.monotonic()) >= self._check_s:
+                self._check_s = real_s + CHECK_S
+                self._check_alarms(real_s)
+
+    def _check_alarms(self, real_s: float) -> None:
+        """Begin and end alarms by what the fleet shows."""
+        now = self._listener.view.snapshot(real_s)
+        findings = check_fleet(now, self._earlier[0] if len(self._earlier) == self._earlier.maxlen else None)
+        self._earlier.append(now)
+        for alarm in self._alarms.update(findings, self._time_s(), real_s):
+            self._change(alarm)
+
+    def _change(self, alarm: Alarm) -> None:
+        self._tell(alarm)
+        self._on_loop(lambda: self._on_alarm(alarm))
+
+    def _tell(self, alarm: Alarm) -> None:
+        """Publish the state of an alarm, and show it here, also if the router forwards it to nobody."""
+        self._publish(alarm)
+        self._listener.view.update(alarm.monitor, alarm, time.monotonic())
+
+    def _time_s(self) -> float:
+        """Fleet time, by the last message of any arm."""
+        last = self._earlier[-1].arms if self._earlier else ()
+        return max((arm.time_s for arm in last if arm.time_s is not None), default=0.0)
 
     def _message(self, topic: str, name: str, message: msgspec.Struct) -> None:
         self._on_loop(lambda: self._add(topic, name, encode(message)))

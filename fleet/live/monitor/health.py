@@ -1,7 +1,7 @@
 """Health of a fleet: findings from a snapshot, clock replies and malformed messages."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from shlex import quote
 from statistics import median
@@ -12,13 +12,18 @@ import msgspec
 from fleet.live.clock import FleetClock
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetSnapshot
 
-EXPECTED = (
-    "It is released at", "It waits for", "are paused", "has not been offered", "has a break", "are planning",
-    "is above its warning limit", "is faulted",
-)  # fmt: skip
-"""Parts of the reasons of jobs that wait in order."""
-BY_POLICY = "The policy lets it wait"
+REASONS = {
+    "It is released at": "release", "It waits for": "predecessor", "are paused": "paused", "paused by": "paused",
+    "has not been offered": "queue", "has a break": "break", "are planning": "planning",
+    "is above its warning limit": "hot", "is faulted": "faulted", "It waits until": "space",
+    "No arm can do it": "no_arm", "The policy lets it wait": "policy", "Its place was in use": "place",
+    "has a job": "busy",
+}  # fmt: skip
+"""Class of the reason of a waiting job, by a part of it; the first part that it has counts."""
+EXPECTED = ("release", "predecessor", "paused", "queue", "break", "planning", "hot", "faulted")
+"""Classes of jobs that wait in order."""
 MOST_REASONS = 5
+NO_OFFSETS: Mapping[str, float] = {}
 OFFSET_S, SLOW_S = 1.0, 0.1
 """Real seconds: clock offsets and round trips above these are findings."""
 
@@ -26,9 +31,13 @@ OFFSET_S, SLOW_S = 1.0, 0.1
 class Finding(msgspec.Struct, frozen=True):
     """One statement about the fleet."""
 
-    level: Literal["fault", "warning"]
-    """fault: the fleet cannot work; warning: it works, but needs attention."""
+    level: Literal["fault", "warning", "note"]
+    """fault: the fleet cannot work; warning: it works, but needs attention; note: it is as it should be."""
     what: str
+    kind: str = ""
+    """Kind of the alarm that it raises; "" for none."""
+    subject: str = ""
+    """Arm or job of the alarm; "" for the fleet. An alarm lasts while there is a finding of its kind and subject."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +101,7 @@ def check_health(
     offsets_s = {arm.arm: offset_s(arm, now_s, clock) for arm in fleet.arms if arm.time_s is not None} if clock else {}
     findings = [
         *check_auctioneers(fleet, probes, auctioneer),
-        *(finding for arm in fleet.arms for finding in check_arm(arm, offsets_s.get(arm.arm))),
+        *check_fleet(fleet, earlier, offsets_s),
     ]
     if missing := [name for name in expected if name not in {arm.arm for arm in fleet.arms if arm.token}]:
         findings.append(Finding("fault", f"Not present: {', '.join(missing)}."))
@@ -109,13 +118,7 @@ def check_health(
         findings.append(
             Finding("warning", f"{overrun} message(s) dropped: they arrived faster than they were processed.")
         )
-    if unfinished := fleet.counts.get("unfinished", 0):
-        outcome = f"{unfinished} job(s) are unfinished, so their outcome is unknown; their status names the reason."
-        findings.append(Finding("warning", outcome))
-    if given_up := fleet.counts.get("given_up", 0):
-        findings.append(Finding("warning", f"{given_up} job(s) are abandoned; their status names the reason."))
     findings += [Finding("fault", sentence) for sentence in other_versions]
-    findings += [*check_progress(fleet, earlier), *check_space(fleet)]
     return HealthReport(
         fleet=fleet.fleet,
         round_trip_s=median(trips_s) if trips_s else None,
@@ -126,22 +129,52 @@ def check_health(
     )
 
 
+def check_fleet(
+    fleet: FleetSnapshot, earlier: FleetSnapshot | None, offsets_s: Mapping[str, float] = NO_OFFSETS
+) -> list[Finding]:
+    """What snapshots show of arms, jobs and space: the findings that raise alarms.
+
+    Args:
+        earlier: As in `check_health`.
+        offsets_s: As in a report.
+    """
+    arms = (finding for arm in fleet.arms for finding in check_arm(arm, offsets_s.get(arm.arm)))
+    return [*arms, *check_jobs(fleet), *check_progress(fleet, earlier), *check_space(fleet)]
+
+
+def check_jobs(fleet: FleetSnapshot) -> list[Finding]:
+    """Check that no job is unfinished or abandoned."""
+    words = {"unfinished": "is unfinished, so its outcome is unknown", "given_up": "is abandoned"}
+    return [
+        Finding("warning", f"'{job.job}' {words[job.state]}: {job.reason or 'no reason'}", job.state, job.job)
+        for job in fleet.jobs
+        if job.state in words
+    ]
+
+
 def check_progress(fleet: FleetSnapshot, earlier: FleetSnapshot | None) -> list[Finding]:
     """Check that no job waits while arms are idle and none works, by the reasons that the fleet gives."""
     if earlier is None or _at_work(fleet) or _at_work(earlier):
         return []
     before = {status.job for status in earlier.jobs if status.state == "waiting"}
     waiting = [status for status in fleet.jobs if status.state == "waiting" and status.job in before]
-    reasons = Counter(status.reason for status in waiting if not any(known in status.reason for known in EXPECTED))
+    reasons = Counter(status.reason for status in waiting if reason_class(status.reason) not in EXPECTED)
     idle = [arm.arm for arm in fleet.arms if arm.present and arm.mode == "idle" and not arm.job]
     return [
         Finding(
-            "warning" if reason.startswith(BY_POLICY) else "fault",
+            "warning" if reason_class(reason) == "policy" else "fault",
             f"{f'{count} jobs wait' if count > 1 else '1 job waits'} though no arm works and "
             f"{f'{len(idle)} arms are' if idle[1:] else f'{idle[0]} is'} idle. {reason}",
+            "no_progress",
+            reason_class(reason),
         )
         for reason, count in reasons.most_common(MOST_REASONS if idle else 0)
     ]
+
+
+def reason_class(reason: str) -> str:
+    """Class of the reason of a waiting job, of `REASONS`; "other" for any other one."""
+    return next((name for part, name in REASONS.items() if part in reason), "other")
 
 
 def _in_the_way(reason: str) -> list[str]:
@@ -169,6 +202,8 @@ def check_space(fleet: FleetSnapshot) -> list[Finding]:
                 f"The space of {arm} stays closed to other arms, as {arm} is not present{since}"
                 f"{f'; {waits} job(s) wait for it' if waits else ''}. If you have seen that it is at home or removed, "
                 f"and is switched off: thermofleet arm clear {quote(arm)}",
+                "space",
+                arm,
             )
         )
     return findings
@@ -207,11 +242,15 @@ def check_arm(arm: ArmSnapshot, offset_s: float | None) -> list[Finding]:
         problem = "shows its token but publishes no state: its process may hang."
     elif age_s > FRESH_S:
         problem = f"is stale: its last state is {age_s:.1f} s old. Its process may hang."
-    findings = [Finding("fault", f"{arm.arm} {problem}")] if problem else []
+    findings = [Finding("fault", f"{arm.arm} {problem}", "absent", arm.arm)] if problem else []
     if arm.mode == "faulted":
-        findings.append(Finding("warning", f"{arm.arm} is faulted: joint {arm.joint} is at {arm.hottest_c:.1f} °C."))
+        hot = f"{arm.arm} is faulted: joint {arm.joint} is at {arm.hottest_c:.1f} °C."
+        findings.append(Finding("warning", hot, "fault", arm.arm))
+    if arm.break_end_s is not None:
+        findings.append(Finding("note", f"{arm.arm} is in a break until {arm.break_end_s:.0f} s of fleet time."))
     if arm.bad_sensor:
-        findings.append(Finding("warning", f"{arm.arm} has impossible temperatures: {arm.bad_sensor}."))
+        wrong = f"{arm.arm} has impossible temperatures: {arm.bad_sensor}."
+        findings.append(Finding("warning", wrong, "sensor", arm.arm))
     if offset_s is not None and abs(offset_s) > OFFSET_S:
         offset = f"{abs(offset_s):.1f} s {'ahead of' if offset_s > 0 else 'behind'} fleet time"
         findings.append(Finding("fault", f"{arm.arm} is {offset}: its machine may be overloaded, or its process hang."))

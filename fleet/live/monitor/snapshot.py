@@ -9,13 +9,14 @@ import logging
 import math
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import repeat
 from typing import Literal, TypeVar
 
 import msgspec
+from msgspec.structs import replace
 
 from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import auction, keys
@@ -31,8 +32,9 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.keys import PUBLISHED
 from fleet.bus.protocol.messages import DifficultyScores, Info, State, encode
-from fleet.bus.protocol.operator import ALL_ARMS, ControlRequest, Operation, Pause, Resume
+from fleet.bus.protocol.operator import ALL_ARMS, Alarm, ControlRequest, Operation, Pause, Resume
 from fleet.errors import BusError
+from fleet.events import EVENT_KINDS
 from fleet.live.sensors import ArmSensors
 from fleet.telemetry import Mode
 
@@ -40,7 +42,7 @@ _LOG = logging.getLogger(__name__)
 
 FRESH_S = 3.0
 """Real seconds: an arm is present when it shows its token and its last state is no older than this."""
-MAX_NAMES, MAX_JOBS = 1024, 4096
+MAX_NAMES, MAX_JOBS, MAX_ALARMS = 1024, 4096, 256
 COMPLETE_BYTES = 32_000
 """A status reply that is smaller, and has fewer jobs than one message may have, names all jobs."""
 
@@ -109,6 +111,18 @@ class ArmSnapshot(msgspec.Struct, frozen=True):
     """It reports that it is away from home."""
     scores: dict[str, JobScore] = {}
     """Of the jobs that have not ended."""
+    p_saturation: float | None = None
+    """P that a motor passes the warning limit in the rest of its current job."""
+    break_end_s: float | None = None
+    """Fleet time at which its present break ends; None outside of breaks."""
+    worked_s: float = 0.0
+    """Fleet seconds of work since this listener began."""
+    heat_n2m2s: float = 0.0
+    """Sum of squared motor torques over that time: the losses in the windings grow with it."""
+    events: dict[str, int] = {}
+    """Number of its events since then, and of those that it still cached, by kind."""
+    idle: str = ""
+    """Why a present arm has no job; "" if it has one."""
     joints: int | None = None
     twin: str = ""
     event: str = ""
@@ -144,6 +158,8 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
     """Who paused an arm, by arm, from the last status reply; "*" for all arms."""
     speed: float | None = None
     """Fleet seconds per real second."""
+    alarms: tuple[Alarm, ...] = ()
+    """Those that last, and the last of the others; the most recently changed last."""
 
 
 @dataclass
@@ -152,6 +168,24 @@ class _Arm:
     messages: dict[type, tuple[msgspec.Struct, float]] = field(default_factory=dict[type, tuple[msgspec.Struct, float]])
     """The last message of each type, and the real second it came."""
     sensors: ArmSensors = field(default_factory=ArmSensors)
+    worked_s: float = 0.0
+    heat_n2m2s: float = 0.0
+    break_end_s: float | None = None
+    events: Counter[str] = field(default_factory=Counter[str])
+
+    def follow(self, state: State) -> None:
+        """Add the time since the last state to the work and heat of the arm."""
+        before, _ = self.last(State)
+        passed_s = 0.0 if before is None else state.time_s - before.time_s
+        if before is not None and passed_s > 0.0 and state.epoch == before.epoch:
+            self.worked_s += passed_s if before.mode == "working" else 0.0
+            self.heat_n2m2s += passed_s * sum(torque * torque for torque in before.tau)
+
+    def count(self, event: ArmEvent) -> None:
+        """Count an event; those of unknown kinds together, so that no sender can fill the memory."""
+        self.events[event.kind if event.kind in EVENT_KINDS else "other"] += 1
+        if event.kind in ("break", "break_end"):
+            self.break_end_s = event.time_s + (event.value or 0.0) if event.kind == "break" else None
 
     def last(self, kind: type[Message]) -> tuple[Message | None, float]:
         message, at_s = self.messages.get(kind, (None, 0.0))
@@ -187,6 +221,7 @@ class FleetView:
     _space: dict[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
     _paused: dict[str, str] = field(default_factory=dict[str, str])
     _jobs: "Recent[str, _Job]" = field(default_factory=lambda: Recent(MAX_JOBS))
+    _alarms: "Recent[str, Alarm]" = field(default_factory=lambda: Recent(MAX_ALARMS))
 
     def set_token(self, role: Role, name: str, present: bool) -> bool:
         """Note that a token appeared or disappeared; return whether that is a change."""
@@ -203,10 +238,15 @@ class FleetView:
         elif isinstance(message, Operation):
             if message.time_s >= max((known.time_s for known in self._auctioneers.values()), default=-math.inf):
                 self._pause(message.request)
+        elif isinstance(message, Alarm):
+            self._alarms[message.alarm] = message
         elif isinstance(message, State):
             arm = self._arm(name)
+            arm.follow(message)
             arm.messages[State] = arm.sensors.check(message), now_s
         elif isinstance(message, DifficultyScores | Info | ArmEvent):
+            if isinstance(message, ArmEvent):
+                self._arm(name).count(message)
             self._arm(name).messages[type(message)] = message, now_s
 
     def update_jobs(self, reply: Status, now_s: float) -> None:
@@ -238,9 +278,11 @@ class FleetView:
         """The fleet at the real second `now_s`, with at most `jobs` of the jobs that changed last."""
         statuses = [job.status for job in self._jobs.values()]
         ended = {status.job for status in statuses if status.state in ("finished", "unfinished")}
+        waiting = {status.job: status.reason for status in statuses if status.state == "waiting"}
+        arms = (_arm_snapshot(name, self._arms[name], now_s, self.speed, ended) for name in sorted(self._arms))
         return FleetSnapshot(
             fleet=self.fleet,
-            arms=tuple(_arm_snapshot(name, self._arms[name], now_s, self.speed, ended) for name in sorted(self._arms)),
+            arms=tuple(replace(arm, idle=why_idle(arm, waiting, self._paused)) for arm in arms),
             auctioneers=tuple(
                 AuctioneerSnapshot(name, known.token, None if known.heard_s is None else now_s - known.heard_s)
                 for name, known in sorted(self._auctioneers.items())
@@ -250,6 +292,7 @@ class FleetView:
             space=self._space,
             paused=dict(self._paused),
             speed=self.speed,
+            alarms=tuple(self._alarms.values()),
         )
 
     def _pause(self, request: ControlRequest) -> None:
@@ -307,7 +350,8 @@ class FleetListener:
         self._status_due_s = time.monotonic()
         for channel, message in PUBLISHED.items():
             expression = keys.of_every(link.fleet, channel.role, channel.topic)
-            link.subscribe(expression, message, partial(self._message, channel.topic), history=True)
+            most = 1 if channel.topic == "state" else None  # of a thousand cached states only the last one matters
+            link.subscribe(expression, message, partial(self._message, channel.topic), history=True, most=most)
         link.watch_tokens(keys.of_every_arm(link.fleet, "alive"), partial(self._token, "arm"))
         link.watch_tokens(keys.of_every_auction(link.fleet, "alive"), partial(self._token, "auction"))
 
@@ -369,6 +413,30 @@ def describe_status(status: JobStatus) -> str:
     return f"{status.job}: {status.state}{arm}{end}{f': {status.reason}' if status.reason else ''}"
 
 
+def why_idle(arm: ArmSnapshot, waiting: Mapping[str, str], paused: Mapping[str, str]) -> str:
+    """Why an arm has no job now; "" for one that has a job or is not present.
+
+    Args:
+        waiting: Reasons of the waiting jobs, by job.
+        paused: As in a snapshot.
+    """
+    if not arm.present or arm.job:
+        return ""
+    if (pause := next((name for name in (ALL_ARMS, arm.arm) if name in paused), None)) is not None:
+        return f"It is paused by '{paused[pause]}'."
+    if arm.mode == "faulted":
+        return "It is faulted."
+    if arm.break_end_s is not None:
+        return f"It is in a break until {arm.break_end_s:.0f} s."
+    if arm.headroom_k is not None and arm.headroom_k <= 0.0:
+        return "It is above its warning limit."
+    if not waiting:
+        return "No job waits."
+    named = next((f" {job}: {reason}" for job, reason in waiting.items() if arm.arm in reason), "")
+    able = sum(job in waiting and score != JobScore() for job, score in arm.scores.items())
+    return f"It has bids for {able} of {len(waiting)} waiting jobs.{named}"
+
+
 def _complete(reply: Status) -> bool:
     """Whether a status reply had room for every job."""
     return len(reply.jobs) < auction.MOST_JOBS and len(encode(reply)) < COMPLETE_BYTES
@@ -398,6 +466,11 @@ def _arm_snapshot(name: str, arm: _Arm, now_s: float, speed: float | None, ended
         bad_sensor=arm.sensors.fault,
         motion_difficulty=state.motion_difficulty if state else None,
         expected_c=state.expected_c if state else (),
+        p_saturation=state.job_p_saturation if state else None,
+        break_end_s=arm.break_end_s,
+        worked_s=arm.worked_s,
+        heat_n2m2s=arm.heat_n2m2s,
+        events=dict(arm.events),
         job=state.job if state else "",
         busy_s=state.busy_s if state else 0.0,
         away=bool(state and state.space),

@@ -93,6 +93,9 @@ function makeActions(gateway, fleet) {
       send("/v4/reset", { arm }, (reply) => [`${arm}: ${reply.changed ? "its fault is cleared." : "it has no fault."}`]);
     }
   }
+  async function acknowledge({ alarm, what }) {
+    if (await confirm("Acknowledge this alarm?", what, "I have seen it")) send("/v4/alarms", { alarm }, (reply) => [`${reply.by} has seen it.`]);
+  }
   async function clear(arm) {
     const text = "Only if you have seen that this arm is at home or removed, and switched off: other arms will use its space.";
     if (await confirm(`Free the space of ${arm}?`, text, "Free the space")) {
@@ -201,5 +204,5 @@ function makeActions(gateway, fleet) {
       button.title = may(button.dataset.role) ? "" : `This needs the role ${button.dataset.role} (this page has ${fleet.role}).`;
     }
   }
-  return { may, allow, offer, cancel, settle, change, pause, resume, reset, clear };
+  return { may, allow, offer, cancel, settle, change, pause, resume, reset, clear, acknowledge };
 }

@@ -1,7 +1,7 @@
 // The live page: the fleet as its messages show it.
 "use strict";
 
-const FRESH_S = 3, DRAW_MS = 60, TABLES_MS = 500, POLL_MS = 2000, MOST_JOBS = 300, MOST_ROWS = 60, MOST_NOTES = 300, MOST_AWARDS = 20;
+const FRESH_S = 3, DRAW_MS = 60, TABLES_MS = 500, POLL_MS = 2000, MOST_JOBS = 300, MOST_ROWS = 60, MOST_NOTES = 300, MOST_AWARDS = 20, MOST_ALARMS = 20;
 const MODES = { idle: "○ idle", working: "▶ working", faulted: "✖ faulted" };
 const STATES = {
   waiting: "… waiting", awarded: "▶ awarded", finishing: "▶ finishing", finished: "✔ finished", unfinished: "? unfinished",
@@ -161,10 +161,12 @@ function startPage() {
   async function poll() {
     const snapshot = await gateway.request(`/v4/fleet?jobs=${MOST_JOBS}`);
     const nowMs = performance.now();
-    Object.assign(fleet, { name: snapshot.fleet, counts: snapshot.counts, paused: snapshot.paused, speed: snapshot.speed, auctioneers: snapshot.auctioneers });
+    Object.assign(fleet, { name: snapshot.fleet, counts: snapshot.counts, paused: snapshot.paused, speed: snapshot.speed, auctioneers: snapshot.auctioneers, alarms: snapshot.alarms });
+    const total = (field) => snapshot.arms.reduce((sum, one) => sum + one[field], 0), workedS = total("worked_s"), heated = total("heat_n2m2s");
     for (const one of snapshot.arms) {
       const arm = armOf(one.arm);
-      Object.assign(arm, { token: one.token, badSensor: one.bad_sensor, possibleC: one.temp_c });
+      Object.assign(arm, { token: one.token, badSensor: one.bad_sensor, possibleC: one.temp_c, idle: one.idle });
+      arm.shares = [[one.worked_s, workedS], [one.heat_n2m2s, heated]].map(([part, all]) => all ? `${Math.round(100 * part / all)} %` : "—").join(", ");
       if (one.state_age_s !== null) arm.atMs = Math.max(arm.atMs, nowMs - 1000 * one.state_age_s);
       arm.difficultyMs = one.difficulty_age_s === null ? null : nowMs - 1000 * one.difficulty_age_s;
     }
@@ -176,7 +178,7 @@ function startPage() {
 
   // Pictures and tables
 
-  const arms = makeTable(element("arms"), 8), jobs = makeTable(element("jobs"), 6), settled = makeTable(element("settled"), 5);
+  const arms = makeTable(element("arms"), 9), alarms = makeTable(element("alarms"), 3), jobs = makeTable(element("jobs"), 6), settled = makeTable(element("settled"), 5);
   const offered = makeTable(element("offers"), 3), present = new Map();
 
   const temperatures = (arm) => (arm.badSensor ? arm.possibleC : arm.state.temp_c);
@@ -198,7 +200,7 @@ function startPage() {
   }
 
   function fillArm(row, arm) {
-    const [name, mode, hot, job, cycles, predicted, messages, requests] = row.cells, { state } = arm, here = isPresent(arm);
+    const [name, mode, hot, job, cycles, predicted, shares, messages, requests] = row.cells, { state } = arm, here = isPresent(arm);
     if (!name.firstChild) {
       const button = make("button", { type: "button", class: "plain", title: "Look at this arm" }, visible(arm.name));
       button.addEventListener("click", () => {
@@ -222,7 +224,8 @@ function startPage() {
       bar.firstChild.style.width = `${Math.round(100 * Math.min(1, Math.max(0, share)))}%`;
       if (view) bar.firstChild.style.background = `#${view.heatColour(tempC).convertLinearToSRGB().getHexString()}`;
     } else setText(text, "—");
-    setText(job, (state && state.job) || "—");
+    setText(job, (state && state.job) || (here && arm.idle) || "—");
+    setText(shares, arm.shares || "—");
     setText(cycles, of && of.repetitions ? `${of.cycles} of ${of.repetitions}` : state && state.job_cycles_left ? `${state.job_cycles_left} left` : "—");
     const finish = of && of.finish_s != null ? `done in ${clock(of.finish_s - fleetTime())}` : "";
     const peak = state && state.job_peak_c != null ? `peak ${state.job_peak_c.toFixed(1)} °C` : "";
@@ -270,6 +273,26 @@ function startPage() {
     setText(row.cells[2], text.join(";  ") || (winner ? `✔ ${winner}` : "none"));
   }
 
+  const isOpen = (alarm) => alarm.ended_s === null || !alarm.by;
+
+  // Alarms that last and those that nobody has seen, then the last of the others.
+  function drawAlarms() {
+    const all = [...(fleet.alarms || [])].reverse();
+    const listed = [...all.filter(isOpen), ...all.filter((alarm) => !isOpen(alarm))].slice(0, MOST_ALARMS);
+    element("alarms").hidden = !listed.length;
+    alarms.update(listed.map((alarm) => [alarm.alarm, alarm]), (row, alarm) => {
+      const [what, lasts, seen] = row.cells;
+      setText(what, alarm.what);
+      setText(lasts, alarm.ended_s === null ? `since ${clock(alarm.began_s)}` : `${clock(alarm.began_s)} to ${clock(alarm.ended_s)}`);
+      setClass(row, alarm.ended_s === null && !alarm.by ? "fault" : alarm.by ? "" : "warning");
+      if (!seen.firstChild) seen.append(make("span"), make("span"));
+      const at = alarm.acknowledged ? new Date(alarm.acknowledged).toLocaleString() : "";
+      setText(seen.firstChild, alarm.by ? `${alarm.by}, ${at}` : actions.may("operator") ? "" : "nobody");
+      setButtons(seen.lastChild, alarm.by || !actions.may("operator") ? [] : [{ text: "Acknowledge", label: `Acknowledge: ${alarm.what}`, act: () => actions.acknowledge(alarm) }]);
+    });
+  }
+
+  // What needs attention and is no alarm.
   const some = (names) => names.slice(0, 20).join(", ") + (names.length > 20 ? ` and ${names.length - 20} more` : "");
   function alerts() {
     const list = [], all = [...fleet.arms.values()].sort(byName);
@@ -277,19 +300,12 @@ function startPage() {
     if (connected && !all.some((arm) => arm.token) && !fleet.auctioneers.some((each) => each.token)) {
       add("nobody", "fault", "No arm and no auctioneer is present: the router or the fleet may be down. This page waits for them.");
     } else {
-      const absent = all.filter((arm) => !isPresent(arm)).map((arm) => arm.name), faulted = all.filter((arm) => isPresent(arm) && arm.state.mode === "faulted");
-      for (const arm of faulted) add(`faulted/${arm.name}`, "fault", `${arm.name} is faulted.`);
-      if (absent.length) add(`absent/${absent}`, "fault", `Absent: ${some(absent)}.`);
       const warm = all.filter((arm) => heat && isPresent(arm) && Math.max(...temperatures(arm)) >= heat.warning_c)
         .map((arm) => `${arm.name} (joint ${temperatures(arm).indexOf(Math.max(...temperatures(arm))) + 1})`);
-      for (const arm of all) if (arm.badSensor) add(`sensor/${arm.name}/${arm.badSensor.slice(0, 7)}`, "warning", `${arm.name} has impossible temperatures: ${arm.badSensor}.`);
       if (warm.length) add(`warm/${warm}`, "warning", `Above the warning limit: ${some(warm)}.`);
     }
     for (const [arm, by] of Object.entries(fleet.paused)) add(`paused/${arm}/${by}`, "pause", `${arm === "*" ? "All arms are" : `${arm} is`} paused${by ? ` by ${by}` : ""}.`);
-    const unfinished = [...fleet.jobs.values()].filter(({ state }) => state === "unfinished").length;
-    if (unfinished) add(`unfinished/${unfinished}`, "warning", `${unfinished} job(s) unfinished: look at the cell, then settle each as done or redo.`);
-    if (fleet.counts.given_up) add(`given/${fleet.counts.given_up}`, "warning", `${fleet.counts.given_up} job(s) given up.`);
-    if (!list.length) add("none", "none", connected ? "None." : "Unknown while the gateway does not answer.");
+    if (!list.length && !(fleet.alarms || []).some(isOpen)) add("none", "none", connected ? "None." : "Unknown while the gateway does not answer.");
     const words = { fault: "✖ Fault: ", warning: "▲ Warning: ", pause: "❚❚ ", none: "" }, place = element("alert-list");
     const known = new Map([...place.children].map((item) => [item.dataset.key, item]));
     for (const [key, item] of known) if (!list.some(([one]) => one === key)) item.remove();
@@ -316,6 +332,7 @@ function startPage() {
       ...awards.map((award) => [award.key, { job: award.job, state: `✔ to ${award.arm}`, winner: award.arm, scores: award.offers }]),
     ], fillOffer);
     alerts();
+    drawAlarms();
     actions.allow();
   }
 

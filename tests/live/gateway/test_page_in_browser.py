@@ -171,12 +171,12 @@ def test_a_job_is_changed_and_settled_and_the_space_of_an_absent_arm_freed(serve
     confirm(page)
     answer(page).to_contain_text("late: waiting")
     assert fleet.requests[-1].action == Change("late", value=7.0)
-    expect(page.locator("#alert-list")).to_contain_text("1 job(s) unfinished")
+    expect(page.locator("#alarms")).to_contain_text("'lost' is unfinished")
     page.get_by_role("button", name="Done lost").click()
     confirm(page)
     answer(page).to_contain_text("lost: finished")
     assert fleet.requests[-1].action == Settle("lost", "done")
-    expect(page.locator("#alert-list")).to_contain_text("Absent: gone")
+    expect(page.locator("#arms tbody tr", has_text="gone")).to_contain_text("◌ absent")
     page.get_by_role("button", name="Free the space of gone").click()
     confirm(page)
     answer(page).to_contain_text("gone: its space is free")
@@ -186,9 +186,9 @@ def test_a_job_is_changed_and_settled_and_the_space_of_an_absent_arm_freed(serve
 def test_a_fault_is_told_in_words_and_reset(served, fleet, open_page):
     page = open_page(served)
     fleet.mode["arm_1"], fleet.temp_c["arm_1"] = "faulted", 76.0
-    expect(page.locator("#alert-list")).to_contain_text("Fault: arm_1 is faulted.")
     expect(page.locator("#arms tbody tr").nth(1)).to_contain_text("✖ faulted")
     expect(page.locator("#arms tbody tr").nth(1)).to_contain_text("above the limit")
+    expect(page.locator("#alarms")).to_contain_text("arm_1 is faulted: joint ")
     page.get_by_role("button", name="Reset arm_1").click()
     confirm(page)
     answer(page).to_contain_text("arm_1: its fault is cleared")
@@ -330,5 +330,21 @@ def test_the_page_connects_again_to_a_gateway_and_a_router_that_return(browser, 
                 expect(page.locator("#arms tbody tr")).to_contain_text("◌ absent")
                 with Router(port):
                     expect(page.locator("#arms tbody tr")).to_contain_text("○ idle")
-                    expect(page.locator("#alert-list")).to_contain_text("None.")
+                    expect(page.locator("#alert-list")).not_to_contain_text("may be down")
                     assert fleet.mode == {"arm_0": "idle"}
+
+
+def test_an_alarm_stays_after_a_reload_until_somebody_has_seen_it(served, fleet, open_page):
+    fleet.post(lambda: fleet.set("lost", state="given_up", reason="three faults"))
+    page = open_page(served)
+    row = page.locator("#alarms tbody tr", has_text="'lost' is abandoned: three faults")
+    expect(row).to_contain_text("since")
+    row.get_by_role("button", name="Acknowledge").click()
+    confirm(page, "bob")
+    answer(page).to_contain_text("bob has seen it.")
+    page.reload()
+    expect(row).to_contain_text("bob, ")
+    expect(row.get_by_role("button")).to_have_count(0)
+    arms = page.locator("#arms tbody tr")
+    expect(arms.first).to_contain_text(" %")
+    expect(arms.first.locator("td[data-label='Job']")).to_contain_text("No job waits.")

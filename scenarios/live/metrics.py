@@ -1,0 +1,85 @@
+"""Figures of a live fleet in the text format of Prometheus (exposition format 0.0.4), at `/metrics` of the gateway."""
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping
+
+from fleet.live.monitor.health import reason_class
+from fleet.live.monitor.snapshot import FleetSnapshot
+
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+METRICS: Mapping[str, tuple[str, str]] = {
+    "jobs": ("gauge", "Jobs by state."),
+    "waiting_jobs": ("gauge", "Waiting jobs by class of reason."),
+    "oldest_waiting_seconds": ("gauge", "Fleet seconds since the release of the oldest waiting job; 0 without one."),
+    "bids": ("gauge", "Open jobs for which an arm has a bid."),
+    "arm_events_total": (
+        "counter",
+        "Events of an arm by kind, such as award, finish and fault, since the gateway began.",
+    ),
+    "motor_temperature_celsius": ("gauge", "Temperature of a motor."),
+    "headroom_kelvin": ("gauge", "From the hottest motor of an arm to its warning limit."),
+    "p_saturation": ("gauge", "P that a motor passes the warning limit in the rest of the current job of an arm."),
+    "work_seconds_total": ("counter", "Fleet seconds of work of an arm since the gateway began."),
+    "heat_total": ("counter", "Sum of squared motor torques of an arm over fleet time, N²m²s."),
+    "present": ("gauge", "Whether an arm shows its token and a fresh state."),
+    "silence_seconds": ("gauge", "Real seconds since the last message of a participant."),
+    "alarms": ("gauge", "Alarms that last, by kind and whether somebody has acknowledged them."),
+    "fleet_speed": ("gauge", "Fleet seconds per real second."),
+}
+"""Type and help of each metric; names begin with `thermofleet_`."""
+Sample = tuple[str, dict[str, str], float | None]
+
+
+def exposition(fleet: FleetSnapshot, alarms: Counter[tuple[str, str]]) -> str:
+    """The metrics of a fleet; what is unknown has no sample.
+
+    Args:
+        alarms: Number of those that last, by kind and "yes" or "no" for acknowledged.
+    """
+    lines: dict[str, list[str]] = {name: [] for name in METRICS}
+    for name, labels, value in samples(fleet, alarms):
+        if value is not None and math.isfinite(value):
+            shown = ",".join(f'{key}="{_escaped(text)}"' for key, text in {"fleet": fleet.fleet, **labels}.items())
+            lines[name].append(f"thermofleet_{name}{{{shown}}} {value:.10g}")
+    return "".join(
+        f"# HELP thermofleet_{name} {text}\n# TYPE thermofleet_{name} {kind}\n"
+        + "".join(f"{line}\n" for line in lines[name])
+        for name, (kind, text) in METRICS.items()
+    )
+
+
+def samples(fleet: FleetSnapshot, alarms: Counter[tuple[str, str]]) -> Iterable[Sample]:
+    """Name, labels and value of every sample; arguments as of `exposition`."""
+    yield from (("jobs", {"state": state}, count) for state, count in fleet.counts.items())
+    waiting = [status for status in fleet.jobs if status.state == "waiting"]
+    for reason, count in Counter(reason_class(status.reason) for status in waiting).items():
+        yield "waiting_jobs", {"reason": reason}, count
+    now_s = max((arm.time_s for arm in fleet.arms if arm.time_s is not None), default=None)
+    if now_s is not None:
+        released = [now_s - status.release_s for status in waiting if status.release_s is not None]
+        yield "oldest_waiting_seconds", {}, max([0.0, *released])
+    for arm in fleet.arms:
+        own = {"arm": arm.arm}
+        yield "bids", own, len(arm.scores)
+        yield from (("arm_events_total", {**own, "kind": kind}, count) for kind, count in arm.events.items())
+        yield from (
+            ("motor_temperature_celsius", {**own, "joint": str(joint)}, temp_c)
+            for joint, temp_c in enumerate(arm.temp_c, start=1)
+        )
+        yield "headroom_kelvin", own, arm.headroom_k
+        yield "p_saturation", own, arm.p_saturation
+        yield "work_seconds_total", own, arm.worked_s
+        yield "heat_total", own, arm.heat_n2m2s
+        yield "present", own, arm.present
+        yield "silence_seconds", {"participant": arm.arm, "role": "arm"}, arm.state_age_s
+    for auctioneer in fleet.auctioneers:
+        labels = {"participant": auctioneer.auctioneer, "role": "auctioneer"}
+        yield "silence_seconds", labels, auctioneer.heard_age_s
+    for (kind, acknowledged), count in alarms.items():
+        yield "alarms", {"kind": kind, "acknowledged": acknowledged}, count
+    yield "fleet_speed", {}, fleet.speed
+
+
+def _escaped(text: str) -> str:
+    return text.replace("\\", r"\\").replace("\n", r"\n").replace('"', r"\"")

@@ -1,0 +1,119 @@
+"""Alarms as HTTP requests to other programs: signed, repeated until they are accepted, and never waited for.
+
+The body is the message `Alarm` as JSON. `X-Thermofleet-Signature` is `t=TIME,v1=HEX`: the hex digest of HMAC-SHA256
+over `TIME.BODY` with the secret; TIME is in Unix seconds, so that a receiver can refuse what is old.
+"""
+
+import asyncio
+import hashlib
+import hmac
+import ipaddress
+import logging
+import ssl
+import time
+from collections import deque
+from urllib.parse import urlsplit
+
+from fleet.bus.protocol.messages import encode
+from fleet.bus.protocol.operator import Alarm
+from fleet.errors import FleetError
+
+_LOG = logging.getLogger(__name__)
+
+SECRET = "THERMOFLEET_WEBHOOK_SECRET"
+"""Environment variable of the secret."""
+MIN_SECRET = 16
+MOST_WAITING = 256
+"""Alarms that wait for one target; the next one drops the oldest."""
+REPLY_S = 5.0
+"""Real seconds for a whole request."""
+RETRY_S = (1.0, 5.0, 30.0, 120.0)
+"""Real seconds before each repetition; after the last one the alarm is dropped for this target."""
+
+
+class Webhook:
+    """One target: `run` sends what `send` has queued; both on the event loop."""
+
+    def __init__(self, url: str, secret: str) -> None:
+        """Prepare.
+
+        Raises:
+            FleetError: no secret, no URL of HTTP, or plain HTTP beyond loopback.
+        """
+        if len(secret) < MIN_SECRET:
+            raise FleetError(f"--webhook needs a secret to sign with: set {SECRET} to {MIN_SECRET} or more characters.")
+        parts = urlsplit(url)
+        if parts.scheme not in ("http", "https") or not parts.hostname or parts.username:
+            raise FleetError(f"--webhook must be a URL such as http://127.0.0.1:9000/alarms (got '{url}').")
+        if parts.scheme == "http" and not _is_loopback(parts.hostname):
+            raise FleetError(f"--webhook beyond this machine must be https:// (got '{url}').")
+        try:
+            self._port = parts.port or (443 if parts.scheme == "https" else 80)
+        except ValueError as error:
+            raise FleetError(f"--webhook: {error} (got '{url}').") from error
+        self.url, self._secret, self._host = url, secret.encode(), parts.hostname
+        self._tls = ssl.create_default_context() if parts.scheme == "https" else None
+        self._path = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
+        self._waiting: deque[bytes] = deque(maxlen=MOST_WAITING)
+        self._woken = asyncio.Event()
+
+    def send(self, alarm: Alarm) -> None:
+        """Queue an alarm."""
+        if len(self._waiting) == MOST_WAITING:
+            _LOG.warning("'%s' is %d alarms behind; the oldest is dropped.", self.url, MOST_WAITING)
+        self._waiting.append(encode(alarm))
+        self._woken.set()
+
+    async def run(self) -> None:
+        """Send until cancelled."""
+        while True:
+            self._woken.clear()
+            if not self._waiting:
+                await self._woken.wait()
+                continue
+            body = self._waiting.popleft()
+            for wait_s in (*RETRY_S, None):
+                problem = await self._attempt(body)
+                if not problem:
+                    break
+                if wait_s is None:
+                    _LOG.error("'%s' did not accept an alarm (%s): it is dropped there.", self.url, problem)
+                else:
+                    await asyncio.sleep(wait_s)
+
+    async def _attempt(self, body: bytes) -> str:
+        """Send one request; return why it was not accepted, or ""."""
+        try:
+            async with asyncio.timeout(REPLY_S):
+                status = await self._post(body)
+        except TimeoutError:
+            return f"no reply within {REPLY_S:g} s"
+        except (OSError, ValueError) as error:
+            return str(error) or type(error).__name__
+        return "" if 200 <= status < 300 else f"status {status}"
+
+    async def _post(self, body: bytes) -> int:
+        """Status of the reply, whose body is not read: it may have any size."""
+        at = str(int(time.time()))
+        signature = hmac.new(self._secret, at.encode() + b"." + body, hashlib.sha256).hexdigest()
+        head = (
+            f"POST {self._path} HTTP/1.1\r\nHost: {self._host}:{self._port}\r\nContent-Type: application/json\r\n"
+            f"Content-Length: {len(body)}\r\nX-Thermofleet-Signature: t={at},v1={signature}\r\n"
+            "Connection: close\r\n\r\n"
+        )
+        reader, writer = await asyncio.open_connection(self._host, self._port, ssl=self._tls)
+        try:
+            writer.write(head.encode() + body)
+            await writer.drain()
+            return int((await reader.readline()).split(maxsplit=2)[1])
+        except IndexError as error:
+            raise ValueError("no reply of HTTP") from error
+        finally:
+            writer.transport.abort()
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -1,0 +1,218 @@
+"""Metrics, alarms and webhooks of a gateway."""
+
+import asyncio
+import hashlib
+import hmac
+import http.client
+import json
+import re
+from collections import Counter
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from fleet.bus.client import BusClient
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import ArmEvent, JobStatus
+from fleet.bus.protocol.operator import Alarm
+from fleet.errors import FleetError
+from fleet.live.monitor.snapshot import ArmSnapshot, AuctioneerSnapshot, FleetListener, FleetSnapshot
+from scenarios.live import webhooks
+from scenarios.live.metrics import METRICS, exposition
+from scenarios.live.webhooks import MOST_WAITING, Webhook
+from tests.waiting import PATIENCE_S, wait_until
+
+ODD = 'a"b\\c\nd'
+SECRET = "0123456789abcdef"
+ALARM = Alarm("gateway", 1, 2.0, "7d1f", "fault", "arm_0 is faulted.")
+LINE = re.compile(r"(?P<name>[a-z_:]+)\{(?P<labels>.*)\} (?P<value>[-+0-9.e]+)")
+LABEL = re.compile(r'([a-z_]+)="((?:[^"\\\n]|\\["\\n])*)"(?:,|$)')
+
+
+def parsed(text):
+    """Values by name and labels of the exposition format 0.0.4, and types by name; written from its description."""
+    values, types = {}, {}
+    assert text.endswith("\n")
+    for line in text.splitlines():
+        if line.startswith("# TYPE "):
+            _, _, name, kind = line.split(" ")
+            assert name not in types
+            types[name] = kind
+        elif not line.startswith("# HELP "):
+            match = LINE.fullmatch(line)
+            assert match, line
+            labels = LABEL.findall(match["labels"])
+            assert ",".join(f'{key}="{value}"' for key, value in labels) == match["labels"]
+            plain = {k: re.sub(r"\\(.)", lambda m: {"n": "\n"}.get(m[1], m[1]), v) for k, v in labels}
+            key = match["name"], tuple(sorted(plain.items()))
+            assert key not in values
+            assert match["name"] in types
+            values[key] = float(match["value"])
+    return values, types
+
+
+FLEET = FleetSnapshot(
+    "f",
+    (
+        ArmSnapshot(ODD, True, True, time_s=100.0, temp_c=(40.0, 55.5), headroom_k=4.5, p_saturation=0.25,
+                    events={"award": 3}, worked_s=60.0, heat_n2m2s=12.5, state_age_s=0.5),
+        ArmSnapshot("b", False, False),
+    ),
+    (AuctioneerSnapshot("au", True, 1.5),),
+    {"waiting": 2, "finished": 7},
+    (
+        JobStatus("j", "waiting", release_s=40.0, reason="It waits until b is out of the way."),
+        JobStatus("k", "waiting"),
+    ),
+    speed=60.0,
+)  # fmt: skip
+
+
+def test_the_metrics_are_in_the_text_format_of_prometheus():
+    values, types = parsed(exposition(FLEET, Counter({("fault", "no"): 1})))
+
+    def value(name, **labels):
+        return values[f"thermofleet_{name}", tuple(sorted({"fleet": "f", **labels}.items()))]
+
+    assert types == {f"thermofleet_{name}": kind for name, (kind, _) in METRICS.items()}
+    assert {name for name, _ in values} == set(types)
+    assert value("jobs", state="waiting") == 2
+    assert (value("waiting_jobs", reason="space"), value("waiting_jobs", reason="other")) == (1, 1)
+    assert value("oldest_waiting_seconds") == 60.0
+    assert value("motor_temperature_celsius", arm=ODD, joint="2") == 55.5
+    assert value("p_saturation", arm=ODD) == 0.25
+    assert value("arm_events_total", arm=ODD, kind="award") == 3
+    assert value("silence_seconds", participant="au", role="auctioneer") == 1.5
+    assert value("present", arm="b") == 0
+    assert value("alarms", kind="fault", acknowledged="no") == 1
+
+
+def test_the_dashboard_uses_only_metrics_that_are_exported():
+    dashboard = Path(__file__).parents[3] / "docs" / "assets" / "grafana.json"
+    used = set(re.findall(r"thermofleet_(\w+)", dashboard.read_text(encoding="utf-8")))
+    assert used
+    assert used <= set(METRICS)
+    panels = json.loads(dashboard.read_bytes())["panels"]
+    assert all(panel["targets"] and panel["title"] for panel in panels)
+
+
+def test_an_alarm_is_shown_acknowledged_and_published(gateway, arm, router):
+    """The fault of an arm, from its event to the list of every listener on the bus."""
+    with BusClient(router, "f") as link:
+        listener = FleetListener(link)
+        arm.post(lambda: arm.set("lost job", state="given_up", reason="three faults"))
+
+        def alarm():
+            found = [each for each in gateway.ask("GET", "/v4/alarms")[2] if each["subject"] == "lost job"]
+            return found[0] if found else None
+
+        seen = wait_until(alarm)
+        assert (seen["kind"], seen["by"], seen["ended_s"]) == ("given_up", "", None)
+        assert gateway.ask("POST", "/v4/alarms", {"alarm": seen["alarm"], "by": " "})[0] == 409
+        assert gateway.ask("POST", "/v4/alarms", {"alarm": "none", "by": "ann"})[0] == 409
+        status, _, told = gateway.ask("POST", "/v4/alarms", {"alarm": seen["alarm"], "by": "ann"})
+        assert (status, told["by"]) == (200, "ann")
+        assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", told["acknowledged"])
+        assert gateway.ask("POST", "/v4/alarms", {"alarm": seen["alarm"], "by": "bob"})[0] == 409
+
+        def published():
+            listener.serve(0.0)
+            link.serve()
+            alarms = {each.alarm: each for each in listener.view.snapshot(0.0).alarms}
+            return seen["alarm"] in alarms and alarms[seen["alarm"]].by == "ann"
+
+        wait_until(published)
+    line = http.client.HTTPConnection("127.0.0.1", gateway.port, timeout=PATIENCE_S)
+    line.request("GET", "/metrics")
+    reply = line.getresponse()
+    assert reply.headers["Content-Type"] == "text/plain; version=0.0.4; charset=utf-8"
+    values, _ = parsed(reply.read().decode())
+    labels = (("acknowledged", "yes"), ("fleet", "f"), ("kind", "given_up"))
+    assert values["thermofleet_alarms", labels] == 1
+    line.close()
+
+
+def test_events_of_unknown_kinds_are_counted_together(gateway, router):
+    with BusClient(router, "f") as link:
+        publish = link.publisher(keys.of_arm("f", "a+1", "event"), ArmEvent)
+        for number in range(200):
+            publish(ArmEvent("a+1", number, 1.0, f"kind {number}"))
+
+        def counted():
+            arms = gateway.ask("GET", "/v4/fleet")[2]["arms"]
+            return next((one["events"] for one in arms if one["arm"] == "a+1" and one["events"]), None)
+
+        assert set(wait_until(counted)) <= {"other"}
+
+
+async def receiver(replies, requests):
+    """A server that gives these statuses in turn, and keeps what it received; None: it never replies."""
+
+    async def handle(reader, writer):
+        head = (await reader.readuntil(b"\r\n\r\n")).decode()
+        length = int(re.search(r"Content-Length: (\d+)", head)[1])
+        requests.append((head, await reader.readexactly(length)))
+        status = replies.pop(0) if replies else 200
+        if status is None:
+            await reader.read()  # until the sender gives up
+        else:
+            writer.write(f"HTTP/1.1 {status} X\r\n\r\n".encode())
+        writer.close()
+        await writer.wait_closed()
+
+    return await asyncio.start_server(handle, "127.0.0.1", 0)
+
+
+def test_a_webhook_is_signed_and_repeated_until_it_is_accepted(monkeypatch):
+    """A target that fails, and one that never replies, get the alarm again; the next alarm comes after it."""
+    monkeypatch.setattr(webhooks, "RETRY_S", (0.01, 0.01, 0.01))
+    monkeypatch.setattr(webhooks, "REPLY_S", 0.2)
+    requests = []
+
+    async def run():
+        async with await receiver([500, None, 204], requests) as server:
+            hook = Webhook(f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}/in?x=1", SECRET)
+            task = asyncio.create_task(hook.run())
+            hook.send(ALARM)
+            hook.send(msgspec.structs.replace(ALARM, number=2))
+            async with asyncio.timeout(PATIENCE_S):
+                while len(requests) < 4:
+                    await asyncio.sleep(0.01)
+            task.cancel()
+
+    asyncio.run(run())
+    assert [json.loads(body)["number"] for _, body in requests] == [1, 1, 1, 2]
+    for head, body in requests:
+        assert head.startswith("POST /in?x=1 HTTP/1.1\r\n")
+        at, digest = re.search(r"X-Thermofleet-Signature: t=(\d+),v1=(\w+)", head).groups()
+        assert digest == hmac.new(SECRET.encode(), f"{at}.".encode() + body, hashlib.sha256).hexdigest()
+
+
+def test_a_target_that_never_replies_holds_a_bounded_number_of_alarms_and_nothing_else():
+    async def run():
+        async with await receiver([None] * 100, []) as server:
+            hook = Webhook(f"http://localhost:{server.sockets[0].getsockname()[1]}", SECRET)
+            task = asyncio.create_task(hook.run())
+            for number in range(10 * MOST_WAITING):
+                hook.send(msgspec.structs.replace(ALARM, number=number))
+            await asyncio.wait_for(asyncio.sleep(0.05), 1.0)
+            task.cancel()
+            await asyncio.sleep(0.1)  # the server closes, too
+            return len(hook._waiting)
+
+    assert asyncio.run(run()) <= MOST_WAITING
+
+
+@pytest.mark.parametrize(
+    ("url", "secret", "says"),
+    [
+        ("http://127.0.0.1:1/x", "short", "set THERMOFLEET_WEBHOOK_SECRET to 16"),
+        ("http://10.0.0.1/x", SECRET, "must be https"),
+        ("ftp://127.0.0.1/x", SECRET, "must be a URL"),
+        ("http://127.0.0.1:99999/x", SECRET, "Port out of range"),
+    ],
+)
+def test_webhooks_are_for_this_machine_or_encrypted_and_signed(url, secret, says):
+    with pytest.raises(FleetError, match=says):
+        Webhook(url, secret)

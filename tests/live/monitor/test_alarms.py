@@ -1,0 +1,108 @@
+"""Alarms begin once, end once, survive a restart from their messages, and keep who has seen them."""
+
+from datetime import UTC, datetime
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet.errors import Refused
+from fleet.live.monitor.alarms import HOLD_S, AlarmList
+from fleet.live.monitor.health import Finding
+from fleet.live.monitor.snapshot import MAX_ALARMS, FleetView
+from tests.live.monitor.messages import state
+
+HOT = Finding("warning", "a is faulted.", "fault", "a")
+NOON = datetime(2026, 1, 31, 12, 0, tzinfo=UTC)
+
+
+@given(st.lists(st.booleans(), min_size=1, max_size=60))
+def test_an_alarm_lasts_from_the_first_finding_until_a_pause_longer_than_the_hold(there):
+    """By hand: one check a second; a run of more than `HOLD_S` checks without the finding separates two alarms."""
+    alarms = AlarmList("m")
+    changes = [alarms.update([HOT] if each else [], float(s), float(s)) for s, each in enumerate(there)]
+    text = "".join("x" if each else " " for each in there)
+    runs = [run for run in text.split(" " * (int(HOLD_S) + 1)) if "x" in run]
+    began = [change for each in changes for change in each if change.ended_s is None]
+    assert len(began) == len(runs)
+    assert [each.began_s for each in began][:1] == ([float(text.index("x"))] if runs else [])
+    ended = [change for each in changes for change in each if change.ended_s is not None]
+    assert len(ended) == len(runs) - (len(text) - len(text.rstrip(" ")) <= HOLD_S and bool(runs))
+    numbers = [change.number for each in changes for change in each]
+    assert numbers == list(range(1, len(numbers) + 1))
+
+
+def test_a_restart_continues_the_alarms_of_its_messages():
+    """The same finding raises no second alarm; who has seen it is kept; one that is gone ends after the hold."""
+    first = AlarmList("m")
+    sent = first.update([HOT, Finding("fault", "no one works", "no_progress", "space")], 10.0, 1000.0)
+    sent.append(first.acknowledge(sent[0].alarm, " ann ", 12.0, NOON))
+    again = AlarmList("m", sent)
+    assert again.update([HOT], 20.0, 3000.0) == []
+    (ended,) = again.update([HOT], 30.0, 3000.0 + HOLD_S + 0.1)
+    assert (ended.kind, ended.ended_s, ended.number) == ("no_progress", 30.0, 4)
+    kept = again.alarms[sent[0].alarm]
+    assert (kept.by, kept.acknowledged, kept.ended_s) == ("ann", "2026-01-31T12:00:00Z", None)
+    with pytest.raises(Refused, match="'ann' has acknowledged it at 2026-01-31T12:00:00Z"):
+        again.acknowledge(kept.alarm, "bob", 31.0, NOON)
+    for name, by, reason in (("none", "ann", "no alarm 'none'"), (ended.alarm, "  ", "name of a person")):
+        with pytest.raises(Refused, match=reason):
+            again.acknowledge(name, by, 31.0, NOON)
+
+
+def test_the_list_is_bounded_and_keeps_what_lasts():
+    alarms, every = AlarmList("m"), [Finding("warning", str(n), "given_up", str(n)) for n in range(5 * MAX_ALARMS)]
+    alarms.update([HOT], 0.0, 0.0)
+    for n, finding in enumerate(every):
+        alarms.update([HOT, finding], 0.0, 10.0 * n)
+    assert len(alarms.alarms) == MAX_ALARMS
+    assert [each.subject for each in alarms.alarms.values() if each.kind == "fault"] == ["a"]
+    alarms.update(every, 0.0, 1e6)
+    assert len(alarms.alarms) == MAX_ALARMS
+
+
+def test_findings_without_a_kind_raise_no_alarm():
+    assert AlarmList("m").update([Finding("fault", "The router is slow.")], 0.0, 0.0) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "waiting", "paused", "says"),
+    [
+        ({"job": "j", "mode": "working"}, {}, {}, ""),
+        ({}, {}, {"*": "ann"}, "It is paused by 'ann'."),
+        ({"mode": "faulted"}, {}, {}, "It is faulted."),
+        ({"headroom_k": -1.0}, {"j": "x"}, {}, "It is above its warning limit."),
+        ({}, {}, {}, "No job waits."),
+        (
+            {},
+            {"j": "It waits until a is out of the way."},
+            {},
+            "It has bids for 0 of 1 waiting jobs. j: It waits until",
+        ),
+    ],
+)
+def test_an_arm_without_a_job_says_why(change, waiting, paused, says):
+    from fleet.bus.protocol.auction import JobStatus, Status
+
+    view = FleetView("f")
+    view.set_token("arm", "a", True)
+    view.update("a", state(**change), 0.0)
+    jobs = tuple(JobStatus(job, "waiting", reason=reason) for job, reason in waiting.items())
+    view.update_jobs(Status("au", 1.0, jobs, paused=paused), 0.0)
+    (arm,) = view.snapshot(0.0).arms
+    assert arm.idle.startswith(says)
+    assert bool(arm.idle) == bool(says)
+
+
+def test_work_and_heat_are_sums_over_the_time_between_states():
+    """By hand: 10 s at work with torques 3 and 4 Nm, then 5 s idle with 2 Nm: 10 s of work, 10 · 25 + 5 · 4 N²m²s."""
+    view = FleetView("f")
+    for time_s, mode, tau in (
+        (0.0, "working", (3.0, 4.0, 0.0)),
+        (10.0, "idle", (2.0, 0.0, 0.0)),
+        (15.0, "idle", (1.0, 1.0, 1.0)),
+    ):
+        view.update("a", state(time_s=time_s, mode=mode, tau=tau), 0.0)
+    view.update("a", state(time_s=500.0, epoch="new", tau=(9.0, 9.0, 9.0)), 0.0)  # another epoch has another clock
+    (arm,) = view.snapshot(0.0).arms
+    assert (arm.worked_s, arm.heat_n2m2s) == (10.0, 270.0)
