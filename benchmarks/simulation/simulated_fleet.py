@@ -191,9 +191,9 @@ class Fleet:
                     holders[active.job] = name
 
     def _check_known(self) -> None:
-        ledger = self.node(AUCTIONEER).auctioneer.ledger
-        if len(self.submitter.accepted) > len(ledger.jobs) + len(ledger.past):
-            lost = [name for name in self.submitter.accepted if name not in ledger.jobs and name not in ledger.past]
+        book = self.node(AUCTIONEER).book
+        if len(self.submitter.accepted) > len(book.jobs) + len(book.past):
+            lost = [name for name in self.submitter.accepted if name not in book.jobs and name not in book.past]
             raise Violation(f"The auctioneer does not know '{lost[0]}', which it accepted.")
 
     def _after_exit(self, process: Process) -> None:

@@ -386,21 +386,24 @@ class CommitPermitted(msgspec.Struct, frozen=True, tag="commit_permitted"):
 
 
 class Released(msgspec.Struct, frozen=True, tag="released"):
-    """The arm no longer has the award, and has nothing to report on it."""
+    """The arm no longer has the award, and has nothing to report on it, or has not reported it."""
 
     award: Name
     job: str = ""
     arm: str = ""
-    number: Count = 0
-    """Number of the claim that released it, where arms allocate by consensus."""
+    outcome: Literal["released", "refused", "dropped"] = "released"
+    """refused: the arm did not accept it; dropped: its lease has expired."""
+    cycles: Count = 0
+    """Done so far, by any arm."""
+    time_s: float = 0.0
+    reason: str = ""
 
 
 class Closed(msgspec.Struct, frozen=True, tag="closed"):
     """An award has ended."""
 
     award: Name
-    outcome: Literal["finished", "returned", "refused", "dropped"]
-    """refused: the arm did not accept it; dropped: its lease has expired."""
+    outcome: Literal["finished", "returned"]
     cycles: Count
     """Done so far, by any arm."""
     time_s: float
@@ -420,8 +423,6 @@ class SpaceTaken(msgspec.Struct, frozen=True, tag="space_taken"):
     space: tuple[Name, ...] = ()
     """Names, without those of its open awards."""
     time_s: float = 0.0
-    number: Count = 0
-    """Of the claim that reports it, where arms allocate by consensus."""
 
 
 class SpaceCleared(msgspec.Struct, frozen=True, tag="space_cleared"):

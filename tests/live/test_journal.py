@@ -18,8 +18,7 @@ from fleet.live import journal
 from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, JobsFinished, ReportReceived
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.node import AuctionNode
-from fleet.live.auction.records import AuctionRecord
-from fleet.live.consensus.jobs import GrantRecord, Register
+from fleet.live.book import BookRecord, JobBook
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
 from fleet.live.journal import Closed, CommitPermitted, CompactingJournal, Journal, Started, TimeRecorder
@@ -313,14 +312,14 @@ def test_after_a_failed_sync_of_the_folder_further_writes_are_refused(tmp_path):
 def test_fleet_time_never_runs_backwards_after_a_restart(tmp_path, monkeypatch):
     """Not even if the journal was compacted after the last job event."""
     monkeypatch.setattr(journal, "COMPACT_BYTES", 1)
-    with Journal[GrantRecord](tmp_path / "j", GrantRecord) as book:
-        recorder = TimeRecorder(book, Register(), real_s=0.0)
+    with Journal[BookRecord](tmp_path / "j", BookRecord) as book:
+        recorder = TimeRecorder(book, JobBook(), real_s=0.0)
         assert recorder.start_s(speed=60.0) == 0.0
         for real_s in range(1, 30):
             recorder.step(float(real_s), 60.0 * real_s)
         assert len(list(book.records())) < 10
-    with Journal[GrantRecord](tmp_path / "j", GrantRecord) as book:
-        again = TimeRecorder(book, Register().replay(book.records()), real_s=0.0)
+    with Journal[BookRecord](tmp_path / "j", BookRecord) as book:
+        again = TimeRecorder(book, JobBook().replay(book.records()), real_s=0.0)
         assert 29 * 60.0 <= again.start_s(speed=60.0) <= 31 * 60.0
 
 
@@ -358,7 +357,7 @@ def test_a_history_of_long_names_fits_into_one_message():
     assert len(encode(message)) < 65_536
 
 
-KINDS = {"arm": ArmRecord, "arm without auctioneer": GrantRecord, "auctioneer": AuctionRecord}
+KINDS = {"arm": ArmRecord, "arm without auctioneer": BookRecord, "auctioneer": BookRecord}
 
 
 def start(kind: str, name: str, journal) -> None:

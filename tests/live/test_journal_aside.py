@@ -18,10 +18,9 @@ from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Pause, R
 from fleet.errors import JournalError, Refused
 from fleet.live import journal as journal_module
 from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, ReportReceived
-from fleet.live.auction.auctioneer import objection
-from fleet.live.auction.ledger import Ledger
-from fleet.live.auction.records import AuctionRecord, Awarded, Checked, Operated, salvage
+from fleet.live.book import BookRecord, Checked, JobBook, salvage
 from fleet.live.journal import ClockTick, Closed, CommitPermitted, JobsAccepted, Journal, Progress, Started, quarantine
+from tests.live.records import awarded, closed, requested
 from tests.live.simulated import SimulatedFleet
 from tests.profiles import examples
 
@@ -66,7 +65,7 @@ class Worked:
             fleet.world.processes[AUCTIONEER].kill("is killed")
         self.file = fleet.world.processes[AUCTIONEER].disk.names["auction"]
         lines = [msgspec.json.decode(line)["records"] for line in self.file.data.splitlines()]
-        self.journal = [record for line in lines for record in msgspec.convert(line, list[AuctionRecord])]
+        self.journal = [record for line in lines for record in msgspec.convert(line, list[BookRecord])]
         self.checked = max(i for i, record in enumerate(self.journal) if isinstance(record, Checked))
         """Place of the last check: no journal can tell that a later record is missing."""
 
@@ -94,7 +93,7 @@ def worked(seed: int) -> Worked:
     return Worked(seed)
 
 
-def altered(record, rng: random.Random, kind=AuctionRecord):
+def altered(record, rng: random.Random, kind=BookRecord):
     """Return the record with one field changed to another value that can be read."""
     content = json.loads(msgspec.json.encode(record))
     places = []
@@ -126,7 +125,7 @@ def altered(record, rng: random.Random, kind=AuctionRecord):
     return None
 
 
-def wrong_journal(records, kind: str, index: int, rng: random.Random, record_kind=AuctionRecord):
+def wrong_journal(records, kind: str, index: int, rng: random.Random, record_kind=BookRecord):
     records, record = list(records), records[index]
     if kind == "deleted":
         del records[index]
@@ -154,13 +153,13 @@ def names_in(*records) -> set[str]:
 @given(st.integers(0, 5), st.sampled_from(KINDS), st.integers(0, 10_000), st.randoms(use_true_random=False))
 def test_one_wrong_record_leaves_other_jobs_as_they_are_and_no_job_is_done_twice(seed, kind, index, rng):
     records, arms = worked(seed).journal, worked(seed).fleet.arms
-    whole = Ledger(arms=arms).replay(records)
+    whole = JobBook(arms=arms).replay(records)
     index = 1 + index % worked(seed).checked  # without the snapshot, which is the whole journal
     journal = wrong_journal(records, kind, index, rng)
     if journal is None:
         return
     kept: list[bytes] = []
-    ledger = Ledger(arms=arms).replay(journal, lambda record, reason: kept.append(record))
+    ledger = JobBook(arms=arms).replay(journal, lambda record, reason: kept.append(record))
     before, after = ({each.job: each for each in book.status()} for book in (whole, ledger))
     touched = names_in(records[index], journal[min(index, len(journal) - 1)])
     aside = {name for name, status in after.items() if status.reason.startswith("Quarantined")}
@@ -173,7 +172,7 @@ def test_one_wrong_record_leaves_other_jobs_as_they_are_and_no_job_is_done_twice
     for name in aside:
         assert after[name].state == "unfinished"
         assert name not in {job.name for job in ledger.ready(1e6, 99)}
-    again = Ledger(arms=arms).replay(ledger.compact())
+    again = JobBook(arms=arms).replay(ledger.compact())
     assert again.status() == ledger.status(), "it is the same after the next start"
 
     again = Worked(seed)
@@ -189,7 +188,7 @@ def journal_of(path, records: list[dict]):
     """Write records with a right checksum, as another version may have written them; return the journal."""
     body = json.dumps(records).encode()
     path.write_bytes(b'{"crc":"%08x","records":%s}\n' % (zlib.crc32(body), body))
-    return Journal[AuctionRecord](path, AuctionRecord, quarantine=salvage(quarantine(path.with_suffix(".aside"), "au")))
+    return Journal[BookRecord](path, BookRecord, quarantine=salvage(quarantine(path.with_suffix(".aside"), "au")))
 
 
 def as_json(record) -> dict:
@@ -200,17 +199,17 @@ def as_json(record) -> dict:
 def test_a_job_that_cannot_be_read_is_quarantined_alone_and_settled_by_a_person(tmp_path, in_snapshot):
     """`dwell_s` in milliseconds, from a version that had no bounds; an award of it follows."""
     jobs = JobsAccepted((spec("good"), spec("poison"), spec("after", "poison")))
-    record = as_json(Ledger().replay([jobs]).compact()[0] if in_snapshot else jobs)
+    record = as_json(JobBook().replay([jobs]).compact()[0] if in_snapshot else jobs)
     poison = record["jobs"][1]["spec"] if in_snapshot else record["jobs"][1]
     poison["dwell_s"] = 60_000
-    awarded = as_json(Awarded("r:poison", "r", "poison", "arm_0", "q", 0, 1.0))
+    award = as_json(awarded("r:poison", "poison"))
     path = tmp_path / "au.journal"
-    with journal_of(path, [record, awarded]) as book:
-        ledger = Ledger().replay(book.records(), book.quarantine)
+    with journal_of(path, [record, award]) as book:
+        ledger = JobBook().replay(book.records(), book.quarantine)
         book.compact(*ledger.compact())
     assert "60000" in path.with_suffix(".aside").read_text()
-    with Journal[AuctionRecord](path, AuctionRecord) as book:
-        ledger = Ledger().replay(book.records())
+    with Journal[BookRecord](path, BookRecord) as book:
+        ledger = JobBook().replay(book.records())
     states = {each.job: each for each in ledger.status()}
     assert {name: each.state for name, each in states.items()} == {
         "good": "waiting",
@@ -222,23 +221,23 @@ def test_a_job_that_cannot_be_read_is_quarantined_alone_and_settled_by_a_person(
     refused = ledger.admit([spec("poison")])[0]
     assert (refused.accepted, "settle it first" in refused.reason) == (False, True)
     with pytest.raises(Refused, match="quarantined"):
-        objection(ledger, ControlRequest("1", Cancel("poison")), frozenset())
-    done, redo = (Ledger().replay(ledger.compact()) for _ in range(2))
-    done.apply(Operated(ControlRequest("1", Settle("poison", "done")), 2.0))
+        ledger.objection(ControlRequest("1", Cancel("poison")), frozenset())
+    done, redo = (JobBook().replay(ledger.compact()) for _ in range(2))
+    done.apply(requested(Settle("poison", "done"), 2.0))
     assert [job.name for job in done.ready(1.0, 9)] == ["after", "good"]
-    redo.apply(Operated(ControlRequest("1", Settle("poison", "redo")), 2.0))
+    redo.apply(requested(Settle("poison", "redo"), 2.0))
     assert redo.admit([spec("poison")])[0].accepted
 
 
 def test_a_job_quarantined_by_contradiction_waits_again_after_it_was_settled():
-    twice = [Awarded(f"r{i}:a", f"r{i}", "a", "arm_0", "q", 0, 1.0) for i in range(2)]
-    ledger = Ledger().replay([JobsAccepted((spec("a"), spec("b"))), *twice])
+    twice = [awarded(f"r{i}:a", "a") for i in range(2)]
+    ledger = JobBook().replay([JobsAccepted((spec("a"), spec("b"))), *twice])
     assert [(each.job, each.state) for each in ledger.status()] == [("a", "unfinished"), ("b", "waiting")]
     with pytest.raises(Refused, match="may still do the last cycle"):
-        objection(ledger, ControlRequest("1", Settle("a", "redo")), frozenset())
-    ledger.apply(Closed("r0:a", "returned", 1, 2.0))
+        ledger.objection(ControlRequest("1", Settle("a", "redo")), frozenset())
+    ledger.apply(closed("r0:a", "returned", 1, 2.0))
     assert ledger.status(["a"])[0].state == "unfinished"
-    ledger.apply(Operated(ControlRequest("1", Settle("a", "redo")), 3.0))
+    ledger.apply(requested(Settle("a", "redo"), 3.0, awards=("r0:a",)))
     assert ledger.status(["a"])[0].state == "waiting"
 
 

@@ -339,7 +339,7 @@ class Stage:
         return SubmissionReply("auctioneer", tuple(Admission(job.name, True) for job in submission.jobs))
 
     def end(self) -> None:
-        self.auctioneer.ledger.ended = True
+        self.auctioneer.book.ended = True
 
 
 NAMES = {"a": 0.0, "b": 3700.0, "c": 7000.0, "d": 10000.0}
@@ -360,7 +360,7 @@ def test_a_stream_is_submitted_as_released(monkeypatch, stage, horizon_s, submit
     monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
     stream = [(at_s, JobSpec(name, "hold", ("x",))) for name, at_s in NAMES.items()]
     live_auction.submit_stream(stage, stream, horizon_s, SimpleNamespace(is_set=lambda: False))
-    assert (stage.submitted, stage.auctioneer.ledger.ended) == (submitted, ended)
+    assert (stage.submitted, stage.auctioneer.book.ended) == (submitted, ended)
 
 
 def test_a_job_message_has_all_fields():

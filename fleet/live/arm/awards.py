@@ -47,6 +47,8 @@ MAX_BYTES = 60_000
 """Size of a history: a router may drop larger messages."""
 MAX_PAST_AWARDS = 256
 """Closed awards whose answer is kept; their quotes expired long ago."""
+REVOKED = "the award was revoked"
+"""Why an award is returned that an auctioneer, or a person, has revoked."""
 
 
 class AwardAccepted(msgspec.Struct, frozen=True, tag="award_accepted"):
@@ -109,7 +111,7 @@ class ActiveAward:
     """Whether the last cycle may begin, under a lease."""
     revoked: bool = False
     """No cycle may begin any more."""
-    why: str = "the award was revoked"
+    why: str = REVOKED
     """Why, if it is."""
     cycles_on_disk: int = 0
     lease_s: float = 0.0
@@ -476,10 +478,15 @@ class AwardExecutor:
         for number, active in enumerate(self.active):
             self._close(active, "returned", time_s, now_s, reason, faulted=faulted and number == 0)
 
-    def revoke(self, reason: str) -> None:
-        """Begin no more cycles of the awards without permission to commit, and return them: the arm has a break."""
+    def revoke(self, reason: str, is_stopped: Callable[[str], bool] = lambda job: True) -> None:
+        """Begin no more cycles of these jobs unless their last cycle is permitted, and return them.
+
+        Args:
+            reason: For which they are returned.
+            is_stopped: Whether a job is one of them; all are by default.
+        """
         for active in self.active:
-            if not (active.may_commit or active.revoked):
+            if is_stopped(active.job) and not (active.may_commit or active.revoked):
                 active.revoked, active.why = True, reason
 
     def return_ended(self, time_s: float, now_s: float, *, at_home: bool) -> None:
