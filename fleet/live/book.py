@@ -48,6 +48,7 @@ from fleet.bus.protocol.auction import (
     Name,
     Offers,
     Report,
+    Result,
 )
 from fleet.bus.protocol.consensus import Faults, History, JobOutcome
 from fleet.bus.protocol.keys import HISTORY
@@ -116,7 +117,7 @@ MAX_SLOTS = 4 * MAX_OPEN_JOBS
 MAX_AWARDS = 16
 """Ended awards of one job on which a report is still expected, and those that were redone, in one request."""
 NUMBERS_SKIPPED = 1_000
-"""Numbers of results that are left out after a journal that was wrong, so that none is used twice."""
+"""Numbers of results and requests left out after a journal that was wrong, so that none is used twice."""
 ALREADY_DONE = "This request was carried out before."
 NO_CHANGE = "Nothing changed: it is so already."
 NO_AWARD = "?"
@@ -229,6 +230,8 @@ class Checked(msgspec.Struct, frozen=True, tag="checked"):
     """Counts them, from 1."""
     changes: int
     """Number of the next change."""
+    operated: int
+    """Number of the next request of a person."""
     jobs: dict[str, int]
     """Checksum of the state of each job that has changed."""
     time_s: float
@@ -240,20 +243,6 @@ class JobsQuarantined(msgspec.Struct, frozen=True, tag="jobs_quarantined"):
 
     jobs: dict[str, str]
     time_s: float = 0.0
-
-
-class JobChange(msgspec.Struct, frozen=True):
-    """A job's state has changed; fields as in `fleet.bus.protocol.auction.Result`."""
-
-    number: int
-    time_s: float
-    status: JobStatus
-    auction: str = ""
-    difficulty: float | None = None
-    p_saturation: float | None = None
-    peak_c: float | None = None
-    by: str = ""
-    offers: Offers = ()
 
 
 class Grant(msgspec.Struct):
@@ -340,7 +329,7 @@ class BookSnapshot(msgspec.Struct, frozen=True, tag="book_snapshot"):
     number: int
     ended: bool
     jobs: tuple[JobEntry, ...]
-    recent: tuple[JobChange, ...]
+    recent: tuple[Result, ...]
     space: dict[str, tuple[str, ...]]
     past: bytes
     left: dict[JobState, int]
@@ -591,7 +580,7 @@ class JobBook(TimedState[BookRecord]):
     number: int = 0
     """Of the next change."""
     ended: bool = False
-    recent: deque[JobChange] = field(default_factory=lambda: deque(maxlen=MAX_RECENT))
+    recent: deque[Result] = field(default_factory=lambda: deque(maxlen=MAX_RECENT))
     operations: Operations = field(default_factory=Operations)
     operated: int = 0
     """Number of the next request of a person."""
@@ -618,7 +607,7 @@ class JobBook(TimedState[BookRecord]):
     _outcomes: int = field(default=0, repr=False, compare=False)
     """Checksum of the outcomes."""
     _keep: Callable[..., object] = field(default=lambda *_: None, repr=False, compare=False)
-    _announce: Callable[[JobChange | Operation], object] = field(default=lambda _: None, repr=False, compare=False)
+    _announce: Callable[[Result | Operation], object] = field(default=lambda _: None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         self.space |= {arm: frozenset([ANYWHERE]) for arm in self.arms}
@@ -629,7 +618,7 @@ class JobBook(TimedState[BookRecord]):
         self,
         keep: Callable[..., object],
         counted_until_s: float,
-        announce: Callable[[JobChange | Operation], object] = lambda _: None,
+        announce: Callable[[Result | Operation], object] = lambda _: None,
     ) -> None:
         """Write further records to a journal.
 
@@ -655,7 +644,7 @@ class JobBook(TimedState[BookRecord]):
             for change in self.apply(record):
                 self._announce(change)
             if isinstance(record, Requested):
-                self._announce(record.operation)
+                self._announce(self.requested[-1])
         for award in self.leases.keys() - self.open.keys():
             del self.leases[award]
 
@@ -691,7 +680,8 @@ class JobBook(TimedState[BookRecord]):
         aside = [name for name in self._aside_jobs() if name not in before]
         if doubts or aside:  # the numbers of the last changes are uncertain
             self.recent.clear()
-            self.number += NUMBERS_SKIPPED
+            self.requested.clear()
+            self.number, self.operated = self.number + NUMBERS_SKIPPED, self.operated + NUMBERS_SKIPPED
         for name in aside:
             self._change(self.status((name,))[0], self.time_s, self.jobs.get(name))
         return self
@@ -724,7 +714,8 @@ class JobBook(TimedState[BookRecord]):
         if not self._unnoted:
             return ()
         jobs = {name: digest(self, name) for name in sorted(self.unchecked) if name in self.jobs}
-        return (Checked(self.checks + 1, self.number, jobs, self.time_s, dict(self.operations.paused)),)
+        paused = dict(self.operations.paused)
+        return (Checked(self.checks + 1, self.number, self.operated, jobs, self.time_s, paused),)
 
     # Questions
 
@@ -963,7 +954,6 @@ class JobBook(TimedState[BookRecord]):
     def operation(self, request: ControlRequest, time_s: float) -> Operation:
         """Return a request as this participant carries it out, later than all others."""
         time_s = max(time_s, math.nextafter(self.operations.last_s, math.inf))
-        terms = (self.operated, self.epoch) if self.is_central else (0, "")
         awards: tuple[str, ...] = ()
         match request.action:
             case Settle(job, "redo") if (entry := self.jobs.get(job)) is not None:
@@ -971,7 +961,8 @@ class JobBook(TimedState[BookRecord]):
                 awards = (*self.operations.redone(job), *last)[-MAX_AWARDS:]
             case _:
                 pass
-        return Operation(self.name, time_s, request, *terms, awards)
+        epoch = self.epoch if self.is_central else ""
+        return Operation(self.name, time_s, request, epoch=epoch, awards=awards)
 
     def objection(self, request: ControlRequest, arms: Set[str]) -> str:
         """Return why a request changes nothing; "" if it changes something.
@@ -1099,7 +1090,7 @@ class JobBook(TimedState[BookRecord]):
 
     # Changes
 
-    def apply(self, record: BookRecord) -> list[JobChange]:
+    def apply(self, record: BookRecord) -> list[Result]:
         """Apply a record that is durable, and return the changes of job states."""
         time_s = getattr(record, "time_s", self.time_s)
         self.time_s = max(self.time_s, time_s)
@@ -1146,8 +1137,9 @@ class JobBook(TimedState[BookRecord]):
             case HistoryAdopted():
                 changed = self._adopt(record)
             case Requested(operation):
+                number = self.operated if self.is_central else 0
+                self.requested.append(replace(operation, number=number))
                 self.operated += 1
-                self.requested.append(operation)
                 by, changed = operation.request.by, self._operate(operation)
             case ShiftEnded():
                 self.ended = True
@@ -1513,15 +1505,21 @@ class JobBook(TimedState[BookRecord]):
 
     def _change(
         self, status: JobStatus, time_s: float, entry: JobEntry | None, by: str = "", offers: Offers = ()
-    ) -> JobChange:
-        change = JobChange(self.number, time_s, status, by=by, offers=offers)
-        if entry is not None:
-            if (cancel := self.operations.cancelled(entry.name)) is not None and entry.state == "cancelled":
-                change = replace(change, by=cancel.request.by)
-            if (grant := entry.grants.get(entry.award)) is not None:
-                award = asdict(grant.record)
-                names = ("auction", "difficulty", "p_saturation", "peak_c")
-                change = replace(change, **{name: award[name] for name in names})
+    ) -> Result:
+        cancel = None if entry is None else self.operations.cancelled(entry.name)
+        change = Result(
+            self.name or NO_AWARD,
+            time_s=time_s,
+            status=status,
+            number=self.number,
+            by=cancel.request.by if cancel is not None and status.state == "cancelled" else by,
+            epoch=self.epoch,
+            offers=offers,
+        )
+        if entry is not None and (grant := entry.grants.get(entry.award)) is not None:
+            award = asdict(grant.record)
+            names = ("auction", "difficulty", "p_saturation", "peak_c")
+            change = replace(change, **{name: award[name] for name in names})
         self.number += 1
         self.recent.append(change)
         return change
@@ -1554,7 +1552,8 @@ class JobBook(TimedState[BookRecord]):
         self.unchecked.clear()
         self._unnoted = False
         if check.number > self.checks:
-            self.checks, self.number = check.number, max(self.number, check.changes)
+            self.checks = check.number
+            self.number, self.operated = max(self.number, check.changes), max(self.operated, check.operated)
 
     def _restore(self, snapshot: BookSnapshot) -> None:
         self.number, self.ended, self.checks = snapshot.number, snapshot.ended, snapshot.checks
@@ -1688,7 +1687,8 @@ def _doubt_check(book: JobBook, record: Checked) -> Doubt | None:
         if name not in book.past and (name not in book.jobs or digest(book, name) != expected):
             wrong.add(name)
     wrong -= {name for name in wrong if name in book.aside or (name in book.jobs and book.jobs[name].aside)}
-    if not wrong and (record.changes, record.paused) == (book.number, book.operations.paused):
+    counts = (record.changes, record.operated, record.paused)
+    if not wrong and counts == (book.number, book.operated, book.operations.paused):
         return None
     return Doubt("the records before do not give the state that was noted", tuple(sorted(wrong)))
 
@@ -1718,13 +1718,13 @@ def rest_of(raw: bytes, reason: str) -> list[BookRecord]:
     fields, bad = cast(dict[str, object], content), set[str]()
     snapshot = fields.get("type") == "book_snapshot"
     parts: dict[str, type[msgspec.Struct]] = {"jobs": JobEntry if snapshot else JobSpec, "finished": JobSpec}
-    for key, kind in (parts | {"recent": JobChange}).items():
+    for key, kind in (parts | {"recent": Result}).items():
         if isinstance(items := fields.get(key), list):
             kept: list[object] = []
             for item in cast(list[object], items):
                 if _is_readable(item, kind):
                     kept.append(item)
-                elif kind is not JobChange:  # of the last messages none is needed
+                elif kind is not Result:  # of the last messages none is needed
                     bad.add(_job_in(item))
             fields[key] = kept
     rest: list[BookRecord] = []

@@ -10,7 +10,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Container, Iterable
 
-from msgspec.structs import asdict, replace
+from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import (
     Ack,
@@ -35,7 +35,6 @@ from fleet.live.book import (
     ContactRegained,
     CountedLease,
     JobBook,
-    JobChange,
     JobSettled,
     ShiftEnded,
     outcome_of,
@@ -271,9 +270,6 @@ class Auctioneer:
         """Record that an arm that is heard takes this space; on a full disk nothing is awarded, and it is repeated."""
         self.book.try_to_record(f"The space of '{arm}' is not recorded", *self.book.retaken_space(arm, space))
 
-    def _announce(self, change: JobChange | Operation) -> None:
-        """Publish a change of a job, or a request of a person, of which peers need not know the awards."""
-        if isinstance(change, Operation):
-            self.out.append(replace(change, awards=()))
-        else:
-            self.out.append(Result(self.name, epoch=self.book.epoch, **asdict(change)))
+    def _announce(self, change: Result | Operation) -> None:
+        """Publish a change of a job, or a request of a person, of which nobody needs to know the awards."""
+        self.out.append(replace(change, awards=()) if isinstance(change, Operation) else change)
