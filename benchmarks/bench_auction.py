@@ -29,9 +29,9 @@ from fleet.bus.protocol.messages import State, encode
 from fleet.bus.router import open_client
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.node import AuctionNode
-from fleet.live.auction.rounds import Timing
-from fleet.live.book import BookRecord
 from fleet.live.journal import Journal
+from fleet.live.leases import Timing
+from fleet.live.records import BookRecord
 from scenarios.live.auctioneer import CentralAllocation
 from scenarios.policy_loader import policy_at
 

@@ -35,10 +35,13 @@ from fleet.bus.protocol.auction import (
     Submission,
 )
 from fleet.live.auction.auctioneer import Auctioneer
-from fleet.live.auction.rounds import Assignment, Bidding, SendAward, Timing
-from fleet.live.book import BookRecord, JobBook
+from fleet.live.auction.rounds import Assignment, Bidding
+from fleet.live.book import JobBook
+from fleet.live.doubts import replay
 from fleet.live.job_rules import MAX_OPEN_JOBS
 from fleet.live.journal import EpochBegun, Journal, TimeRecorder
+from fleet.live.leases import Timing
+from fleet.live.records import BookRecord, SendAward
 
 WEEK_S = 7 * 24 * 3600.0
 BATCH, BACKLOG = 10, 200
@@ -89,7 +92,7 @@ class Week:
     def __init__(self, journal: Journal[BookRecord], disk: Disk, arms: int, jobs: int) -> None:
         self.arms = tuple(f"arm_{number}" for number in range(arms))
         self.real_s, self._disk, self._left, self._made = 0.0, disk, jobs, 0
-        book = JobBook().replay(journal.records())
+        book = replay(JobBook(), journal.records())
         self._recorder = TimeRecorder(journal, book, 0.0)
         journal.append(EpochBegun("soak"))
         self.auctioneer = Auctioneer(

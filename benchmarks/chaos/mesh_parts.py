@@ -20,9 +20,9 @@ from fleet.job import Work
 from fleet.live.arm.awards import ArmRecord
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.node import AuctionNode
-from fleet.live.auction.rounds import Timing
-from fleet.live.book import BookRecord
 from fleet.live.journal import Journal
+from fleet.live.leases import Timing
+from fleet.live.records import BookRecord
 from scenarios.live.arm import PreparedArm, make_node, simulated_arm
 from scenarios.live.auctioneer import CentralAllocation
 from scenarios.policy_loader import policy_at

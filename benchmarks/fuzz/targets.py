@@ -21,8 +21,8 @@ from fleet.bus.protocol.messages import MalformedMessage, decode, encode
 from fleet.bus.security.access_control import read_roster
 from fleet.errors import FleetError, visible
 from fleet.live.arm.awards import ArmHistory, ArmRecord
-from fleet.live.book import BookRecord
 from fleet.live.journal import Journal
+from fleet.live.records import BookRecord
 from scenarios.live.gateway import read_tokens
 from scenarios.live.requests import read_jobs
 from scenarios.spec.load import library

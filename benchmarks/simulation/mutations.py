@@ -14,14 +14,20 @@ from msgspec.structs import replace as changed
 from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Operation, Pause, Resume, Settle
 from fleet.errors import JournalError, Refused
 from fleet.live import journal as journal_module
+from fleet.live import steering as steering_module
 from fleet.live.arm.awards import ArmHistory, AwardAccepted, AwardExecutor
+from fleet.live.auction import auctioneer as auctioneer_module
 from fleet.live.auction import rounds as round_module
 from fleet.live.auction.auctioneer import Auctioneer
-from fleet.live.auction.rounds import Rounds, Timing
-from fleet.live.book import Checked, Granted, JobBook, JobSettled, Requested
+from fleet.live.auction.rounds import Rounds
+from fleet.live.book import JobBook
+from fleet.live.consensus import grants as grants_module
+from fleet.live.consensus import participant as participant_module
 from fleet.live.consensus.grants import Claimant, Granter
 from fleet.live.job_rules import PastJobs, content_hash
 from fleet.live.journal import Closed, CommitPermitted, JobsAccepted, Journal, Released
+from fleet.live.leases import Timing
+from fleet.live.records import Checked, Granted, JobSettled, Requested
 from fleet.live.supervisor import Supervisor
 from scenarios.live.recorder import GapFetcher, Recorder
 
@@ -132,10 +138,10 @@ def _silent(report: Any) -> Any:
 def _expires_all(expire: Any) -> Any:
     """Take a job back although its arm was permitted to commit."""
 
-    def patched(self: Any, real_s: float, time_s: float) -> bool:
-        for name in [name for name, lease in self.leases.items() if real_s >= lease.until_s]:
-            grant = self.open[name].record
-            self.record(Released(name, grant.job, grant.arm, "dropped", 0, time_s, "mutation"))
+    def patched(book: Any, real_s: float, time_s: float) -> bool:
+        for name in [name for name, lease in book.leases.items() if real_s >= lease.until_s]:
+            grant = book.open[name].record
+            book.record(Released(name, grant.job, grant.arm, "dropped", 0, time_s, "mutation"))
         return False
 
     return patched
@@ -222,7 +228,7 @@ add_mutation(
 add_mutation(
     "commit-taken-back",
     "after permission to commit a job goes to no other arm",
-    (JobBook, "expire", _expires_all),
+    *((module, "expire", _expires_all) for module in (auctioneer_module, grants_module, participant_module)),
 )
 add_mutation(
     "duplicate-accepted",
@@ -279,7 +285,7 @@ add_mutation(
 add_mutation(
     "no-backstop",
     "an unanswered award is sent again, or expires",
-    (JobBook, "expire", lambda _: lambda self, real_s, time_s: False),
+    (auctioneer_module, "expire", lambda _: lambda book, real_s, time_s: False),
     alone=False,
 )
 
@@ -302,9 +308,9 @@ def _ignores(action: type) -> Callable[[Any], Any]:
 def _redone_at_once(objection: Any) -> Any:
     """Redo a job although its arm may still do its last cycle."""
 
-    def patched(self: Any, request: ControlRequest, arms: Any) -> str:
+    def patched(book: Any, request: ControlRequest, arms: Any) -> str:
         try:
-            return objection(self, request, arms)
+            return objection(book, request, arms)
         except Refused as refused:
             if "may still do the last cycle" in str(refused):
                 return ""
@@ -316,15 +322,15 @@ def _redone_at_once(objection: Any) -> Any:
 def _cleared_at_once(clear: Any) -> Any:
     """Free the space of an absent arm that may have a lease."""
 
-    def patched(self: Any, *arguments: Any) -> Any:
-        before = {name: grant.silent for name, grant in self.open.items()}
-        for grant in self.open.values():
+    def patched(book: Any, *arguments: Any) -> Any:
+        before = {name: grant.silent for name, grant in book.open.items()}
+        for grant in book.open.values():
             grant.silent = True
         try:
-            return clear(self, *arguments)
+            return clear(book, *arguments)
         finally:
-            for name in before.keys() & self.open.keys():
-                self.open[name].silent = before[name]
+            for name in before.keys() & book.open.keys():
+                book.open[name].silent = before[name]
 
     return patched
 
@@ -381,13 +387,13 @@ add_mutation(
 add_mutation(
     "redo-at-once",
     "nothing is redone that an arm may still do",
-    (JobBook, "objection", _redone_at_once),
+    (steering_module, "objection", _redone_at_once),
     alone=False,
 )
 add_mutation(
     "clear-at-once",
     "space is freed only after the lease of its arm",
-    (JobBook, "clear", _cleared_at_once),
+    (auctioneer_module, "clear", _cleared_at_once),
     alone=False,
 )
 add_mutation(

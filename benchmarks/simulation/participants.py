@@ -27,11 +27,12 @@ from fleet.live.arm import node as arm_module
 from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardExecutor, ExecutorConfig
 from fleet.live.arm.node import ArmConfig, ArmNode, AuctioneerClient
 from fleet.live.auction.node import AuctionNode
-from fleet.live.auction.rounds import Allocate, Timing
-from fleet.live.book import BookRecord
+from fleet.live.auction.rounds import Allocate
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
 from fleet.live.journal import CompactingJournal, Journal
+from fleet.live.leases import Timing
+from fleet.live.records import BookRecord
 from fleet.live.space import Excludes
 from fleet.live.supervisor import Part, Supervisor
 from scenarios.live.arm import fleet_clock, restart_history

@@ -28,7 +28,7 @@ from fleet.bus.protocol.operator import (
     Settle,
 )
 from fleet.job import reason_to_give_up
-from fleet.live.auction.rounds import Timing
+from fleet.live.leases import Timing
 
 LONGEST_WRITES = 60
 """Changing disk calls until a planned crash, at most."""

@@ -16,8 +16,9 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobSpec
 from fleet.bus.protocol.operator import Cleared, ClearRequest
 from fleet.live.auction.knowledge import LiveFleet
-from fleet.live.auction.rounds import Allocate, Assignment, Timing
+from fleet.live.auction.rounds import Allocate, Assignment
 from fleet.live.consensus.participant import Choose, Membership
+from fleet.live.leases import Timing
 from fleet.live.space import ANYWHERE, Excludes
 from fleet.robot import ThermalLimits
 

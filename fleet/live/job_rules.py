@@ -14,13 +14,11 @@ from msgspec import UNSET, Struct
 from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import MOST_JOBS, SETTLED, Admission, JobSpec, JobStatus, Status
-from fleet.bus.protocol.messages import State, encode
+from fleet.bus.protocol.messages import LISTED_BYTES, State, encode
 from fleet.bus.protocol.operator import Change
 
 MAX_OPEN_JOBS = 10_000
 """Jobs of one auctioneer that are neither finished nor given up; more are refused."""
-MAX_BYTES = 60_000
-"""Size of the statuses in one reply: a router may drop larger messages."""
 REASON_LENGTHS = (300, 80, 0)
 """Characters of a reason in a reply to a submission: the first of these with which the reply fits into one message."""
 SHIFT_ENDED = "The shift ended before it was done."
@@ -176,7 +174,7 @@ def _in_one_message(replies: Sequence[Admission]) -> tuple[Admission, ...]:
     """Return the replies with their reasons as short as one message needs: a router may drop a larger one."""
     for length in REASON_LENGTHS:
         replies = [replace(reply, reason=reply.reason[:length]) for reply in replies]
-        if sum(len(encode(reply)) + 1 for reply in replies) <= MAX_BYTES:
+        if sum(len(encode(reply)) + 1 for reply in replies) <= LISTED_BYTES:
             break
     return tuple(replies)
 
@@ -339,4 +337,4 @@ def status_reply(
         kept = sorted(kept, key=lambda status: status.state in SETTLED)[:MOST_JOBS]
     sizes = accumulate((len(encode(status)) + 1 for status in kept), initial=len(encode(reply)))
     next(sizes)
-    return replace(reply, jobs=tuple(status for status, size in zip(kept, sizes, strict=True) if size <= MAX_BYTES))
+    return replace(reply, jobs=tuple(status for status, size in zip(kept, sizes, strict=True) if size <= LISTED_BYTES))

@@ -26,11 +26,11 @@ from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardExecutor, Executor
 from fleet.live.arm.body import Body, ReplayBody, SensorLog
 from fleet.live.arm.estimator import Estimator, NominalPeaks
 from fleet.live.arm.node import ArmConfig, ArmNode, AuctioneerClient, WorkSource
-from fleet.live.book import BookRecord, salvage
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
 from fleet.live.journal import CompactingJournal, Journal, own_records, quarantine
+from fleet.live.records import BookRecord, salvage
 from fleet.motion import Plan
 from scenarios.live.auctioneer import folder_of, live_fleet, refuse_other_way, scenario_jobs, summary
 from scenarios.live.cell import cell_of

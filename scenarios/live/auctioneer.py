@@ -18,9 +18,10 @@ from fleet.errors import BusError, FleetError, Refused
 from fleet.job import Job
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.node import AuctionNode
-from fleet.live.auction.rounds import Allocate, Assignment, Bidding, Timing, resolve_claims
-from fleet.live.book import BookRecord, salvage
+from fleet.live.auction.rounds import Allocate, Assignment, Bidding, resolve_claims
 from fleet.live.journal import Journal, quarantine
+from fleet.live.leases import Timing
+from fleet.live.records import BookRecord, salvage
 from scenarios.live.cell import cell_of
 from scenarios.policy_loader import ON_BUS, OnBus, policy_at, scope_of, without_simulator
 from scenarios.result_folder import disk_errors

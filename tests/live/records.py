@@ -2,8 +2,8 @@
 
 from fleet.bus.protocol.auction import Report
 from fleet.bus.protocol.operator import Action, ControlRequest, Operation
-from fleet.live.book import BookRecord, Granted, JobSettled, Requested, outcome_of
 from fleet.live.journal import Released
+from fleet.live.records import BookRecord, Granted, JobSettled, Requested, outcome_of
 
 
 def awarded(award: str, job: str, arm: str = "arm_0", cycles: int = 0, *, place: str = "rack", **more) -> Granted:

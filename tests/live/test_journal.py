@@ -18,10 +18,12 @@ from fleet.live import journal
 from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, JobsFinished, ReportReceived
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.node import AuctionNode
-from fleet.live.book import BookRecord, JobBook
+from fleet.live.book import JobBook
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
+from fleet.live.doubts import replay
 from fleet.live.journal import Closed, CommitPermitted, CompactingJournal, Journal, Started, TimeRecorder
+from fleet.live.records import BookRecord
 from scenarios.live.arm import restart_history
 from tests.live.council.test_council_poison import Arm
 from tests.live.test_poison import Wire
@@ -319,7 +321,7 @@ def test_fleet_time_never_runs_backwards_after_a_restart(tmp_path, monkeypatch):
             recorder.step(float(real_s), 60.0 * real_s)
         assert len(list(book.records())) < 10
     with Journal[BookRecord](tmp_path / "j", BookRecord) as book:
-        again = TimeRecorder(book, JobBook().replay(book.records()), real_s=0.0)
+        again = TimeRecorder(book, replay(JobBook(), book.records()), real_s=0.0)
         assert 29 * 60.0 <= again.start_s(speed=60.0) <= 31 * 60.0
 
 

@@ -18,8 +18,13 @@ from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Pause, R
 from fleet.errors import JournalError, Refused
 from fleet.live import journal as journal_module
 from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, ReportReceived
-from fleet.live.book import BookRecord, Checked, JobBook, salvage
+from fleet.live.book import JobBook
+from fleet.live.doubts import replay
+from fleet.live.epochs import adopted
 from fleet.live.journal import ClockTick, Closed, CommitPermitted, JobsAccepted, Journal, Progress, Started, quarantine
+from fleet.live.leases import expire
+from fleet.live.records import BookRecord, Checked, salvage
+from fleet.live.steering import objection
 from tests.live.records import awarded, closed, requested
 from tests.live.simulated import SimulatedFleet
 from tests.profiles import examples
@@ -153,13 +158,13 @@ def names_in(*records) -> set[str]:
 @given(st.integers(0, 5), st.sampled_from(KINDS), st.integers(0, 10_000), st.randoms(use_true_random=False))
 def test_one_wrong_record_leaves_other_jobs_as_they_are_and_no_job_is_done_twice(seed, kind, index, rng):
     records, arms = worked(seed).journal, worked(seed).fleet.arms
-    whole = JobBook(arms=arms).replay(records)
+    whole = replay(JobBook(arms=arms), records)
     index = 1 + index % worked(seed).checked  # without the snapshot, which is the whole journal
     journal = wrong_journal(records, kind, index, rng)
     if journal is None:
         return
     kept: list[bytes] = []
-    ledger = JobBook(arms=arms).replay(journal, lambda record, reason: kept.append(record))
+    ledger = replay(JobBook(arms=arms), journal, lambda record, reason: kept.append(record))
     before, after = ({each.job: each for each in book.status()} for book in (whole, ledger))
     touched = names_in(records[index], journal[min(index, len(journal) - 1)])
     aside = {name for name, status in after.items() if status.reason.startswith("Quarantined")}
@@ -172,7 +177,7 @@ def test_one_wrong_record_leaves_other_jobs_as_they_are_and_no_job_is_done_twice
     for name in aside:
         assert after[name].state == "unfinished"
         assert name not in {job.name for job in ledger.ready(1e6, 99)}
-    again = JobBook(arms=arms).replay(ledger.compact())
+    again = replay(JobBook(arms=arms), ledger.compact())
     assert again.status() == ledger.status(), "it is the same after the next start"
 
     again = Worked(seed)
@@ -199,17 +204,17 @@ def as_json(record) -> dict:
 def test_a_job_that_cannot_be_read_is_quarantined_alone_and_settled_by_a_person(tmp_path, in_snapshot):
     """`dwell_s` in milliseconds, from a version that had no bounds; an award of it follows."""
     jobs = JobsAccepted((spec("good"), spec("poison"), spec("after", "poison")))
-    record = as_json(JobBook().replay([jobs]).compact()[0] if in_snapshot else jobs)
+    record = as_json(replay(JobBook(), [jobs]).compact()[0] if in_snapshot else jobs)
     poison = record["jobs"][1]["spec"] if in_snapshot else record["jobs"][1]
     poison["dwell_s"] = 60_000
     award = as_json(awarded("r:poison", "poison"))
     path = tmp_path / "au.journal"
     with journal_of(path, [record, award]) as book:
-        ledger = JobBook().replay(book.records(), book.quarantine)
+        ledger = replay(JobBook(), book.records(), book.quarantine)
         book.compact(*ledger.compact())
     assert "60000" in path.with_suffix(".aside").read_text()
     with Journal[BookRecord](path, BookRecord) as book:
-        ledger = JobBook().replay(book.records())
+        ledger = replay(JobBook(), book.records())
     states = {each.job: each for each in ledger.status()}
     assert {name: each.state for name, each in states.items()} == {
         "good": "waiting",
@@ -221,8 +226,8 @@ def test_a_job_that_cannot_be_read_is_quarantined_alone_and_settled_by_a_person(
     refused = ledger.admit([spec("poison")])[0]
     assert (refused.accepted, "settle it first" in refused.reason) == (False, True)
     with pytest.raises(Refused, match="quarantined"):
-        ledger.objection(ControlRequest("1", Cancel("poison")), frozenset())
-    done, redo = (JobBook().replay(ledger.compact()) for _ in range(2))
+        objection(ledger, ControlRequest("1", Cancel("poison")), frozenset())
+    done, redo = (replay(JobBook(), ledger.compact()) for _ in range(2))
     done.apply(requested(Settle("poison", "done"), 2.0))
     assert [job.name for job in done.ready(1.0, 9)] == ["after", "good"]
     redo.apply(requested(Settle("poison", "redo"), 2.0))
@@ -231,10 +236,10 @@ def test_a_job_that_cannot_be_read_is_quarantined_alone_and_settled_by_a_person(
 
 def test_a_job_quarantined_by_contradiction_waits_again_after_it_was_settled():
     twice = [awarded(f"r{i}:a", "a") for i in range(2)]
-    ledger = JobBook().replay([JobsAccepted((spec("a"), spec("b"))), *twice])
+    ledger = replay(JobBook(), [JobsAccepted((spec("a"), spec("b"))), *twice])
     assert [(each.job, each.state) for each in ledger.status()] == [("a", "unfinished"), ("b", "waiting")]
     with pytest.raises(Refused, match="may still do the last cycle"):
-        ledger.objection(ControlRequest("1", Settle("a", "redo")), frozenset())
+        objection(ledger, ControlRequest("1", Settle("a", "redo")), frozenset())
     ledger.apply(closed("r0:a", "returned", 1, 2.0))
     assert ledger.status(["a"])[0].state == "unfinished"
     ledger.apply(requested(Settle("a", "redo"), 3.0, awards=("r0:a",)))
@@ -277,8 +282,8 @@ def test_one_wrong_record_in_the_journal_of_an_arm_does_not_stop_it(boots, kind,
 def test_an_arm_that_has_a_job_whose_description_is_lost_neither_stops_the_auctioneer_nor_gets_it_again():
     """The journal has lost `JobsAccepted`, and the history of the arm names its award."""
     history = History("arm_0", "e", awards=(Award("r:a", "r", "au", "q", spec("a")),), may_commit=("r:a",))
-    book = JobBook(name="au", epoch="e").replay([awarded("r:a", "a")])
-    assert book.adopted(history) == []
+    book = replay(JobBook(name="au", epoch="e"), [awarded("r:a", "a")])
+    assert adopted(book, history) == []
     assert book.apply(awarded("s:a", "a", "arm_1")) == []
     assert (book.status()[0].state, book.open) == ("unfinished", {})
     book.apply(closed("r:a", "finished", 3, 2.0))
@@ -288,9 +293,9 @@ def test_an_arm_that_has_a_job_whose_description_is_lost_neither_stops_the_aucti
 @pytest.mark.parametrize("is_central", [True, False])
 def test_of_two_grants_of_one_job_one_is_open_and_it_is_not_taken_back(is_central):
     twice = [JobsAccepted((spec("a"),)), awarded("r:a", "a"), awarded("s:a", "a", "arm_1")]
-    book = JobBook(is_central=is_central).replay(twice)
+    book = replay(JobBook(is_central=is_central), twice)
     book.attach(lambda *_: None, counted_until_s=0.0)
-    book.expire(1e6, 0.0)
+    expire(book, 1e6, 0.0)
     assert list(book.open) == ["r:a"]
     assert book.status()[0].state == "unfinished"
     assert book.ready(1e6, 9) == []

@@ -9,10 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.bus.protocol.auction import JobSpec, Quote
-from fleet.live.auction.rounds import Round, stated_spaces
-from fleet.live.book import BookRecord, ContactLost, ContactRegained, Granted, JobBook, ShiftEnded
+from fleet.live.auction.rounds import Round, closed_space, stated_spaces
+from fleet.live.book import JobBook
+from fleet.live.doubts import replay
 from fleet.live.job_rules import PastJobs, admit
 from fleet.live.journal import ClockTick, CommitPermitted, JobsAccepted, SpaceTaken
+from fleet.live.records import BookRecord, ContactLost, ContactRegained, Granted, ShiftEnded
 from tests.live.records import awarded, closed
 from tests.profiles import examples
 
@@ -22,7 +24,7 @@ def spec(name: str, *after: str, place: str = "rack", **changes) -> JobSpec:
 
 
 def ledger(*jobs: JobSpec) -> JobBook:
-    return JobBook().replay([JobsAccepted(jobs, "test", 0.0)])
+    return replay(JobBook(), [JobsAccepted(jobs, "test", 0.0)])
 
 
 def award(job: str, number: int = 0, arm: str = "arm_0", cycles: int = 0, *, place: str = "rack") -> Granted:
@@ -181,10 +183,10 @@ def test_a_quote_says_nothing_about_an_award_that_was_closed_after_the_request(b
         closing = Round("r", (), frozenset(["arm_0"]), 0.0, requested, {"arm_0": at_home})
         return stated_spaces(book, closing, 3.0)
 
-    requested = book.closed_space()
+    requested = closed_space(book)
     book.apply(closed("0:a", "returned", 0, 2.0))
     assert changes(requested) == []
-    assert changes(book.closed_space()) == [SpaceTaken("arm_0", (), 3.0)]
+    assert changes(closed_space(book)) == [SpaceTaken("arm_0", (), 3.0)]
 
 
 def test_after_the_end_of_the_shift_no_job_is_ready():
@@ -204,8 +206,8 @@ steps = st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 9)), max_size=
 
 
 def three_jobs() -> JobBook:
-    return JobBook().replay(
-        [JobsAccepted((spec("a"), spec("b", "a", place="bin"), spec("c", place="belt")), "test", 0.0)]
+    return replay(
+        JobBook(), [JobsAccepted((spec("a"), spec("b", "a", place="bin"), spec("c", place="belt")), "test", 0.0)]
     )
 
 
@@ -241,7 +243,7 @@ def test_a_replay_of_the_journal_gives_the_same_ledger(steps):
     for time_s, (job, choice) in enumerate(steps, start=1):
         written.append(next_record(book, job, choice, time_s))
         changes.extend(book.apply(written[-1]))
-    again = JobBook().replay(written)
+    again = replay(JobBook(), written)
     assert again == book
     assert [change.number for change in changes] == list(range(3, 3 + len(changes)))
     assert again.number == 3 + len(changes)
@@ -257,7 +259,7 @@ def test_a_snapshot_gives_the_same_ledger_as_the_records(steps, later, ends):
     if ends:
         book.apply(ShiftEnded(50.0))
     record = msgspec.json.decode(msgspec.json.encode(book.compact()[0]), type=BookRecord)
-    short = JobBook().replay([record])
+    short = replay(JobBook(), [record])
     for time_s, (job, choice) in enumerate(later, start=100):
         record = next_record(book, job, choice, time_s)
         assert short.apply(record) == book.apply(record)
@@ -276,7 +278,7 @@ def test_a_late_report_changes_the_same_after_compaction(steps, data):
     reported = [grant.record.award for grant in grants if grant.outcome != "refused"]
     if not reported:
         return
-    short, name = JobBook().replay(book.compact()), data.draw(st.sampled_from(reported))
+    short, name = replay(JobBook(), book.compact()), data.draw(st.sampled_from(reported))
     outcome = data.draw(st.sampled_from(["finished", "returned"]))
     late = closed(name, outcome, 2, 100.0, faulted=outcome == "returned" and data.draw(st.booleans()))
     assert short.apply(late) == book.apply(late)
@@ -287,7 +289,7 @@ def test_a_ledger_and_its_snapshot_share_no_objects():
     book = ledger(spec("a"))
     book.apply(award("a"))
     record = book.compact()[0]
-    short = JobBook().replay([record])
+    short = replay(JobBook(), [record])
     book.apply(CommitPermitted("0:a", 2.0))
     assert not record.jobs[0].grants["0:a"].may_commit
     assert short.status()[0].state == "awarded"
@@ -313,11 +315,11 @@ def test_settled_jobs_leave_and_their_names_are_known(monkeypatch):
     book = JobBook(past=PastJobs(limit=4))
     for i in range(9):
         done = award(f"job {i}", i), closed(f"{i}:job {i}", "finished", 4, float(i))
-        book.replay([JobsAccepted((spec(f"job {i}", due_s=float(i), expires=i == 4),)), *(done if i != 4 else ())])
-        book.replay(book.expired(4.5))
+        replay(book, [JobsAccepted((spec(f"job {i}", due_s=float(i), expires=i == 4),)), *(done if i != 4 else ())])
+        replay(book, book.expired(4.5))
     book.apply(JobsAccepted((spec("next", "job 6"), spec("waits"))))
-    short = JobBook(past=PastJobs(limit=4)).replay(
-        msgspec.json.decode(msgspec.json.encode(book.compact()), type=list[BookRecord])
+    short = replay(
+        JobBook(past=PastJobs(limit=4)), msgspec.json.decode(msgspec.json.encode(book.compact()), type=list[BookRecord])
     )
     for each in (book, short):
         assert list(each.jobs) == ["job 7", "job 8", "next", "waits"]
@@ -339,5 +341,5 @@ def test_only_open_jobs_count_against_the_limit(monkeypatch):
     monkeypatch.setattr("fleet.live.book.MAX_SETTLED", 2)
     book = ledger(spec("a"), spec("b"), spec("c"))
     for name in "ab":
-        book.replay([award(name), closed(f"0:{name}", "finished", 4, 1.0)])
+        replay(book, [award(name), closed(f"0:{name}", "finished", 4, 1.0)])
     assert (len(book.jobs), len(book.settled), list(book.waiting)) == (3, 2, ["c"])

@@ -46,9 +46,9 @@ from fleet.live.arm.estimator import MAX_BYTES, Estimator, NominalPeaks, _size
 from fleet.live.arm.node import ArmConfig, ArmNode, PlanningThread
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.rounds import Assignment
-from fleet.live.book import BookRecord
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal, quarantine
+from fleet.live.records import BookRecord
 from fleet.motion import Plan
 from fleet.robot import ThermalLimits
 from tests.profiles import examples

@@ -37,14 +37,11 @@ from fleet.bus.protocol.auction import (
     Receipt,
     Report,
 )
-from fleet.bus.protocol.consensus import MOST_FINISHED, History
-from fleet.bus.protocol.messages import encode
+from fleet.bus.protocol.consensus import MOST_FINISHED, History, with_finished
 from fleet.errors import JournalFull
 from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.journal import Closed, CommitPermitted, JournalState, Progress, Released, Started
 
-MAX_BYTES = 60_000
-"""Size of a history: a router may drop larger messages."""
 MAX_PAST_AWARDS = 256
 """Closed awards whose answer is kept; their quotes expired long ago."""
 REVOKED = "the award was revoked"
@@ -216,13 +213,7 @@ class ArmHistory(JournalState[ArmRecord]):
         active = list(self.active.values())[:MOST_JOBS]
         awards = tuple(replace(each.award, cycles=each.cycles) for each in active)
         may_commit = tuple(each.award.award for each in active if each.may_commit)
-        history = History(arm, self.epoch, (), awards, may_commit)
-        size, finished = len(encode(history)), list[JobSpec]()
-        for job in reversed(self.finished.values()):
-            if (size := size + len(encode(job)) + 1) > MAX_BYTES:
-                break
-            finished.append(job)
-        return replace(history, finished=tuple(reversed(finished)))
+        return with_finished(History(arm, self.epoch, (), awards, may_commit), list(self.finished.values()))
 
 
 def bounded(accepted: dict[str, str], needed: Iterable[str]) -> dict[str, str]:

@@ -29,20 +29,15 @@ from fleet.bus.protocol.consensus import History
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
 from fleet.errors import Refused
-from fleet.live.auction.rounds import MAX_REASON, SCAN_S, Allocate, Out, Rounds, Timing, send_again, unanswered
-from fleet.live.book import (
-    BookRecord,
-    ContactRegained,
-    CountedLease,
-    JobBook,
-    JobSettled,
-    ShiftEnded,
-    outcome_of,
-    requested_job,
-)
+from fleet.live.auction.rounds import SCAN_S, Allocate, Out, Rounds, retaken_space, space_of
+from fleet.live.book import JobBook
+from fleet.live.epochs import adopted
 from fleet.live.job_rules import finish_s, joined_reasons
-from fleet.live.journal import CommitPermitted, JobsAccepted, Released
+from fleet.live.journal import JobsAccepted, Released
+from fleet.live.leases import Timing, clear, expire, progress, renewal, send_again, unanswered
+from fleet.live.records import MAX_REASON, CountedLease, JobSettled, ShiftEnded, outcome_of, requested_job
 from fleet.live.space import Excludes, no_conflicts
+from fleet.live.steering import carry_out, controlled
 
 _LOG = logging.getLogger(__name__)
 
@@ -104,7 +99,7 @@ class Auctioneer:
         its = {entry.award: entry for entry in request.entries if self._is_open(entry, request.arm)}
         leased = {award: entry for award, entry in its.items() if self.book.may_begin(award)}
         revoked = tuple(entry.award for entry in request.entries if entry.award not in leased)
-        self._take_space(request.arm, self.book.space_of(revoked, request.arm))
+        self._take_space(request.arm, space_of(self.book, revoked, request.arm))
         for award, entry in its.items():
             lease = self.book.leases[award]
             lease.unanswered, lease.cycles = None, max(entry.cycles, lease.cycles)
@@ -140,7 +135,7 @@ class Auctioneer:
             if report.outcome == "finished" and not grant.may_commit:
                 _LOG.error("'%s' finished '%s' without permission to commit.", arm, job)
             # The space of an award that has ended may have been freed since.
-            space = self.book.retaken_space(arm, {grant.record.space}) if grant.outcome else []
+            space = retaken_space(self.book, arm, {grant.record.space}) if grant.outcome else []
             shown = replace(report, time_s=min(report.time_s, time_s), reason=report.reason[:MAX_REASON])
             self.book.record(*space, JobSettled(outcome_of(shown, {report.award: arm} if report.faulted else {})))
             if report.outcome == "finished":
@@ -155,7 +150,7 @@ class Auctioneer:
         Raises:
             JournalError: it is not on disk.
         """
-        if records := self.book.adopted(history):
+        if records := adopted(self.book, history):
             _LOG.warning("%d records of what '%s' has done and has are new to the journal.", len(records), history.arm)
             self.book.record(*records)
             for award in self.book.open.keys() - self.book.leases.keys():
@@ -194,19 +189,19 @@ class Auctioneer:
         self.rounds.states[arm] = self.rounds.sensors[arm].check(state)
 
     def clear(self, request: ClearRequest, present: frozenset[str], time_s: float) -> Cleared:
-        """Free the space of an absent arm and end its awards, as `JobBook.clear`."""
-        if self.book.clear(request.arm, request.by, present, self._timing.lease_s, time_s):
+        """Free the space of an absent arm and end its awards, as `clear`."""
+        if clear(self.book, request.arm, request.by, present, self._timing.lease_s, time_s):
             _LOG.warning("The space of '%s' was cleared by '%s'.", request.arm, request.by)
             self.rounds.retry_now()
         return Cleared(self.name, request.arm)
 
     def control(self, request: ControlRequest, time_s: float) -> Controlled:
-        """Carry out a request of a person, as `JobBook.carry_out`."""
-        operation, note = self.book.carry_out(request, self.rounds.present.union(self.book.arms), time_s)
+        """Carry out a request of a person, as `carry_out`."""
+        operation, note = carry_out(self.book, request, self.rounds.present.union(self.book.arms), time_s)
         if operation is not None:
             self.rounds.retry_now()
         job = requested_job(request)
-        return self.book.controlled(request, note, next(iter(self.status((job,))), None) if job else None)
+        return controlled(self.book, request, note, next(iter(self.status((job,))), None) if job else None)
 
     def set_present(self, present: frozenset[str]) -> None:
         """Set which arms are present."""
@@ -216,7 +211,7 @@ class Auctioneer:
 
     def tick(self, real_s: float, time_s: float) -> None:
         """Do what is due."""
-        if self.book.expire(real_s, time_s):
+        if expire(self.book, real_s, time_s):
             self.rounds.retry_now()
         if real_s >= self._checked_s + SCAN_S:
             self._checked_s = real_s
@@ -228,7 +223,7 @@ class Auctioneer:
         """End the shift: nothing more is offered, and open jobs are reported unfinished."""
         if not self.book.ended:
             self.rounds.open = None
-            self.book.record(*self.book.progress(self.book.jobs), ShiftEnded(time_s))
+            self.book.record(*progress(self.book, self.book.jobs), ShiftEnded(time_s))
 
     def finishing(self) -> bool:
         """Return whether a present arm may be in the last cycle of a job."""
@@ -257,18 +252,16 @@ class Auctioneer:
 
     def _permit_commits(self, leased: dict[str, LeaseEntry], time_s: float) -> bool:
         """Record permissions to commit, and contact with silent arms; return whether that is on disk."""
-        records: list[BookRecord] = []
-        for name, entry in leased.items():
-            award = self.book.open[name]
-            if entry.phase == "finishing" and not award.may_commit:
-                records.append(CommitPermitted(name, time_s, entry.cycles))
-            elif award.silent and not self.book.ended:
-                records.append(ContactRegained(name, time_s))
+        renewals = (
+            renewal(self.book, award, time_s, entry.cycles, finishing=entry.phase == "finishing")
+            for award, entry in leased.items()
+        )
+        records = [record for renewal in renewals for record in renewal]
         return self.book.try_to_record("No permission to commit is given", *records)
 
     def _take_space(self, arm: str, space: set[str]) -> None:
         """Record that an arm that is heard takes this space; on a full disk nothing is awarded, and it is repeated."""
-        self.book.try_to_record(f"The space of '{arm}' is not recorded", *self.book.retaken_space(arm, space))
+        self.book.try_to_record(f"The space of '{arm}' is not recorded", *retaken_space(self.book, arm, space))
 
     def _announce(self, change: Result | Operation) -> None:
         """Publish a change of a job, or a request of a person, of which nobody needs to know the awards."""

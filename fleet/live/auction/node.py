@@ -1,11 +1,4 @@
-"""Epochs: an auctioneer whose journal is lost, or an older copy, must not have jobs done again that arms have done.
-
-The epoch is the name of a journal, which arms get with every award and keep on disk. Before an arm counts as present,
-the auctioneer asks what it has finished and what it has. If an arm knows another epoch, the journal was lost: no jobs
-are accepted, unless a new epoch was requested. Then the auctioneer adopts what the arms know.
-
-The auctioneer on the bus: follows which arms are present, runs the auction and publishes fleet time; one thread.
-"""
+"""The auctioneer on the bus: follows which arms are present, runs the auction and publishes fleet time; one thread."""
 
 import logging
 import math
@@ -39,48 +32,19 @@ from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
 from fleet.errors import BusError, JournalError, JournalFull, Refused
 from fleet.live.auction.auctioneer import Auctioneer
-from fleet.live.auction.rounds import SCAN_S, Allocate, Timing
-from fleet.live.book import BookRecord, JobBook, SendAward
+from fleet.live.auction.rounds import SCAN_S, Allocate
+from fleet.live.book import JobBook
 from fleet.live.clock import FleetClock
 from fleet.live.desk import JobDesk
+from fleet.live.doubts import replay
+from fleet.live.epochs import REMEDY, REPLY_S, ask_arms, check_begin, describe
 from fleet.live.journal import EpochBegun, Journal, Started, TimeRecorder, own_records
+from fleet.live.leases import Timing
 from fleet.live.monitor.snapshot import FRESH_S
+from fleet.live.records import BookRecord, SendAward
 from fleet.live.space import Excludes, no_conflicts
 
 _LOG = logging.getLogger(__name__)
-
-REPLY_S = 1.0
-"""Real seconds that an arm has to reply."""
-MAX_NAMED = 5
-"""Jobs that an error names."""
-REMEDY = (
-    "Stop the auctioneer and bring the journal back, or start with --new-epoch: then jobs that the arms have done are "
-    "not done again, and all other jobs of the old journal must be submitted again."
-)
-
-
-def ask_arms(link: BusClient) -> tuple[History, ...]:
-    """Return what the present arms have done and have."""
-    key = keys.of_every_arm(link.fleet, "history")
-    return tuple(link.query_and_wait(key, HistoryRequest(), History, timeout_s=REPLY_S).messages.values())
-
-
-def check_begin(fleet: str, histories: Iterable[History]) -> None:
-    """Check that no arm knows an epoch, so that an auctioneer may begin with an empty journal.
-
-    Raises:
-        BusError: an arm does.
-    """
-    for history in histories:
-        if history.epoch:
-            raise BusError(f"The journal is empty, but fleet '{fleet}' has worked: {describe(history)}. {REMEDY}")
-
-
-def describe(history: History) -> str:
-    """Return what an arm knows, in words."""
-    names = [job.name for job in history.finished[-MAX_NAMED:]]
-    done = f"{len(history.finished)} finished job(s), the last ones {', '.join(names)}" if names else "no finished job"
-    return f"'{history.arm}' knows the epoch '{history.epoch}', {done}, and has {len(history.awards)} job(s)"
 
 
 class EpochCheck:
@@ -200,7 +164,7 @@ class AuctionNode(JobDesk):
         self._link, self.journal = link, journal
         self._timing = timing or Timing()
         self._check_no_auctioneer()
-        book = self.book = JobBook(places, arms).replay(own_records(journal, name), journal.quarantine)
+        book = self.book = replay(JobBook(places, arms), own_records(journal, name), journal.quarantine)
         if not (book.epoch or new_epoch):
             check_begin(link.fleet, ask_arms(link))
         real_s = time.monotonic()

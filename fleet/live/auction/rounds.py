@@ -8,7 +8,7 @@ Rounds of an auction: which jobs are offered when, to whom, and what is awarded.
 import logging
 import math
 from collections import defaultdict
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -16,7 +16,6 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import (
-    LEASE_S,
     MOST_OFFERS,
     NOT_PLANNED,
     Announcement,
@@ -32,10 +31,11 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import ALL_ARMS, Operation
 from fleet.errors import JournalFull
-from fleet.live.book import CountedLease, Granted, JobBook, SendAward
-from fleet.live.clock import CLOCK_DRIFT
+from fleet.live.book import JobBook
 from fleet.live.job_rules import why_not_ready
 from fleet.live.journal import SpaceTaken
+from fleet.live.leases import Timing, unanswered
+from fleet.live.records import CountedLease, Granted, SendAward
 from fleet.live.sensors import ArmSensors
 from fleet.live.space import ANYWHERE, Excludes, arms_in_the_way, no_conflicts
 
@@ -43,38 +43,6 @@ _LOG = logging.getLogger(__name__)
 
 MAX_REASON = 500
 """Characters of a reason, so that a message does not grow with the number of arms."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Timing:
-    """Auction timeouts, in real seconds."""
-
-    lease_s: float = LEASE_S
-    """Length of a lease: an arm may work this long without renewing it."""
-    margin_s: float = 0.25
-    """Between the end of a lease and the next offer of its job."""
-    window_s: float = 0.5
-    """A round closes after this, if not every arm has answered before."""
-    ack_s: float = 1.0
-    """To wait for the answer to an award."""
-    attempts: int = 3
-    """Maximum number of times that an award is sent."""
-    pause_s: tuple[float, float] = (0.25, 2.0)
-    """Between rounds in which nothing was awarded: the first pause and the longest."""
-    max_jobs: int = 64
-    """Jobs in one round; a quote for more would be a large message."""
-
-    def __post_init__(self) -> None:
-        for name in ("lease_s", "margin_s", "window_s", "ack_s", "attempts", "max_jobs"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"Timing.{name} must be > 0 (got {getattr(self, name)}).")
-        if not 0 < self.pause_s[0] <= self.pause_s[1]:
-            raise ValueError(f"Timing.pause_s must be 0 < first <= longest (got {self.pause_s}).")
-
-    @property
-    def counted_lease_s(self) -> float:
-        """Length of a lease as the granting side counts it: longer than the arm does, as clocks differ in rate."""
-        return self.lease_s * (1.0 + CLOCK_DRIFT) + self.margin_s
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,21 +270,6 @@ class Round:
         return (self.asked & present) <= self.quotes.keys()
 
 
-def unanswered(leases: Mapping[str, CountedLease]) -> list[tuple[CountedLease, SendAward]]:
-    """Return the leases of awards that their arms have not answered, and these awards."""
-    return [(lease, lease.unanswered) for lease in leases.values() if lease.unanswered is not None]
-
-
-def send_again(leases: Mapping[str, CountedLease], real_s: float, timing: Timing) -> list[SendAward]:
-    """Return the unanswered awards that are due to be sent again; they count as sent."""
-    due: list[SendAward] = []
-    for lease, message in unanswered(leases):
-        if real_s >= lease.sent_s + timing.ack_s and lease.attempts < timing.attempts:
-            lease.sent_s, lease.attempts = real_s, lease.attempts + 1
-            due.append(message)
-    return due
-
-
 def new_awards(book: JobBook, bidding: Bidding, allocation: Mapping[str, Assignment], time_s: float) -> list[Granted]:
     """Return the records of the awards of a round."""
     records: list[Granted] = []
@@ -345,6 +298,32 @@ def new_awards(book: JobBook, bidding: Bidding, allocation: Mapping[str, Assignm
 
 
 Out = QuoteRequest | SendAward | Announcement | Result | Operation
+
+
+def space_of(book: JobBook, awards: Iterable[str], arm: str) -> set[str]:
+    """Return the names of the spaces of an arm's awards; unknown awards have none."""
+    grants = (book.grant_of(award) for award in awards)
+    return {grant.record.space for grant in grants if grant is not None and grant.record.arm == arm}
+
+
+def closed_space(book: JobBook) -> Mapping[str, frozenset[str]]:
+    """Return the names of the spaces that each arm may take for ended grants alone."""
+    still_open: dict[str, set[str]] = {}
+    for grant in book.open.values():
+        still_open.setdefault(grant.record.arm, set()).add(grant.record.space)
+    return {arm: names - still_open.get(arm, set()) for arm, names in book.space.items()}
+
+
+def retaken_space(book: JobBook, arm: str, space: Set[str]) -> list[SpaceTaken]:
+    """Return what changes when an arm takes this space; it counts as free after a person has freed it.
+
+    Args:
+        space: Names of spaces that the arm takes, or for which it has an award.
+    """
+    taken = book.taken_space().get(arm, frozenset())
+    if ANYWHERE in taken or space <= taken:
+        return []
+    return [SpaceTaken(arm, tuple(sorted(book.space.get(arm, frozenset()) | space)), book.time_s)]
 
 
 def _stated_space(quote: Quote) -> frozenset[str]:
@@ -487,7 +466,7 @@ class Rounds:
         """Open a round; return its name."""
         self._count += 1
         auction = f"{self._name}-{self._boot}-{self._count}"
-        self.open = Round(auction, jobs, asked, real_s + self._timing.window_s, self._book.closed_space())
+        self.open = Round(auction, jobs, asked, real_s + self._timing.window_s, closed_space(self._book))
         return auction
 
     def _ask_for_space(self, real_s: float) -> None:
@@ -497,7 +476,7 @@ class Rounds:
         frees it: a state may have been sent before the award. The quote is a dry run of the last job that was changed.
         """
         book = self._book
-        takes_space = frozenset(arm for arm, names in book.closed_space().items() if names) & self.present
+        takes_space = frozenset(arm for arm, names in closed_space(book).items() if names) & self.present
         if not takes_space or real_s < self._space_s:
             return
         last = book.jobs.get(book.recent[-1].status.job) if book.recent else None

@@ -24,16 +24,16 @@ from fleet.bus.protocol.operator import ALL_ARMS, Operation, Pause, Resume
 from fleet.errors import JournalError, JournalFull, Refused
 from fleet.job import reason_to_give_up
 from fleet.live.arm.awards import REVOKED, ActiveAward, AwardExecutor
-from fleet.live.auction.rounds import Timing
-from fleet.live.book import (
-    MAX_SETTLED,
+from fleet.live.book import MAX_SETTLED, JobBook
+from fleet.live.job_rules import MAX_OPEN_JOBS
+from fleet.live.journal import EpochBegun, JobsAccepted, Progress, Released, SpaceTaken
+from fleet.live.leases import Timing, clear, expire, renewal
+from fleet.live.records import (
     BookRecord,
     ClaimNumbered,
-    ContactRegained,
     CountedLease,
     Faulted,
     Granted,
-    JobBook,
     JobEntry,
     JobSettled,
     Requested,
@@ -41,8 +41,6 @@ from fleet.live.book import (
     outcome_of,
     requested_job,
 )
-from fleet.live.job_rules import MAX_OPEN_JOBS
-from fleet.live.journal import CommitPermitted, EpochBegun, JobsAccepted, Progress, Released, SpaceTaken
 from fleet.live.space import ANYWHERE, Excludes, arms_in_the_way, no_conflicts
 
 
@@ -98,7 +96,7 @@ class Granter:
         self._record(claim, *(Released(each.award, each.job, each.arm, time_s=book.time_s) for each in released))
         for operation in claim.operations:
             self.operate(operation)
-        book.expire(real_s, book.time_s)
+        expire(book, real_s, book.time_s)
         self._set_space(claim)
         book.numbers[claim.arm] = claim.number
         granted: list[GrantedEntry] = []
@@ -113,15 +111,15 @@ class Granter:
         return ClaimReply(self.arm, claim.number, self.timing.lease_s, tuple(granted), tuple(denied))
 
     def clear(self, arm: str, by: str, present: frozenset[str], real_s: float, time_s: float) -> None:
-        """Free the space of an absent arm and revoke its grants, as `JobBook.clear`.
+        """Free the space of an absent arm and revoke its grants, as `clear`.
 
         Raises:
             Refused: the arm is unknown, or present, or may have a lease.
         """
         if arm not in self.roster:
             raise Refused(f"'{arm}' is no arm of this fleet. Arms: {', '.join(sorted(self.roster))}.")
-        self.book.expire(real_s, time_s)
-        self.book.clear(arm, by, present, self.timing.lease_s, time_s)
+        expire(self.book, real_s, time_s)
+        clear(self.book, arm, by, present, self.timing.lease_s, time_s)
 
     def in_the_way(self, arm: str, space: str | None) -> tuple[str, ...]:
         """Return the arms that take a space which excludes this one of an arm."""
@@ -171,7 +169,7 @@ class Granter:
             JournalError: none is on disk.
         """
         book = self.book
-        new = tuple(job for job in jobs if job.name not in book.past and not self._is_known(job.name))
+        new = tuple(job for job in jobs if not book.is_known(job.name))
         new = new[: max(0, MAX_OPEN_JOBS + MAX_SETTLED - len(book.jobs))]
         if new:
             self.book.record(JobsAccepted(new, by, book.time_s))
@@ -195,9 +193,6 @@ class Granter:
         self.book.record(EpochBegun(epoch))
 
     # Inside
-
-    def _is_known(self, job: str) -> bool:
-        return job in self.book.jobs and self.book.jobs[job].spec is not None
 
     def _set_space(self, claim: Claim) -> None:
         """Record which space an arm takes by its claim, without that of its entries that is not granted yet."""
@@ -245,10 +240,7 @@ class Granter:
             terms = (entry.award, entry.job, claim.arm, book.time_s, entry.cycles, entry.places, space, asks)
             records.append(Granted(*terms))
         else:
-            if asks and not grant.may_commit:
-                records.append(CommitPermitted(entry.award, book.time_s, entry.cycles))
-            elif grant.silent:
-                records.append(ContactRegained(entry.award, book.time_s))
+            records += renewal(book, entry.award, book.time_s, entry.cycles, finishing=asks)
             if entry.cycles > job.cycles:
                 records.append(Progress(entry.job, entry.cycles))
             if space not in book.taken_space()[claim.arm]:

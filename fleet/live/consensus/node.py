@@ -1,9 +1,4 @@
-"""Epochs without an auctioneer: an arm whose journals are lost has forgotten what it granted and what was done.
-
-It does not take part beside arms that know it, unless a person requests it (`--new-epoch`). Then it adopts what the
-present arms have done and have, as an auctioneer does (`fleet.live.auction.node`).
-
-An arm without an auctioneer, on the bus: it exchanges bids and claims with its peers and keeps the fleet's time.
+"""An arm without an auctioneer, on the bus: it exchanges bids and claims with its peers and keeps the fleet's time.
 
 The fleet's time is the latest that any arm keeps: an arm that receives a later one sets its clock to it. It begins when
 all arms of the roster are present, or a majority has waited long enough for the others.
@@ -14,87 +9,26 @@ import math
 import secrets
 import time
 from collections import deque
-from collections.abc import Iterable
 from random import Random
 
 from msgspec.structs import replace
 
 from fleet.bus.client import AnotherReplies, Replies
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import (
-    MOST_JOBS,
-    JobSpec,
-    JobStatus,
-    LeaseRequest,
-    Report,
-    Submission,
-    SubmissionReply,
-)
-from fleet.bus.protocol.consensus import MOST_FINISHED, Bid, Claim, ClaimReply, History, HistoryRequest, JobOutcome
-from fleet.bus.protocol.messages import State, encode
+from fleet.bus.protocol.auction import JobStatus, LeaseRequest, Report, Submission, SubmissionReply
+from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply, History, HistoryRequest
+from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
 from fleet.errors import BusError, JournalFull, Refused
-from fleet.live.arm.awards import MAX_BYTES
 from fleet.live.arm.node import ArmNode, RateLimitedWarnings
-from fleet.live.auction.node import REPLY_S, ask_arms, describe
-from fleet.live.book import BookRecord, JobBook
+from fleet.live.book import JobBook
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Granter
 from fleet.live.consensus.participant import QUIET_S, Membership, Participant
 from fleet.live.desk import JobDesk
+from fleet.live.epochs import REPLY_S, adopted, ask_arms, check_journals, history_of
 from fleet.live.journal import Journal, Started, TimeRecorder, own_records
-
-REMEDY = (
-    "Jobs could be done twice. Stop this arm and bring its journals back, or start it with --new-epoch: then it adopts "
-    "what the present arms have done and have; what only absent arms know is lost."
-)
-
-
-def first_number(arm: str, boot: int, book: JobBook) -> int:
-    """Return the number after which the claims and bids of a start of an arm are counted."""
-    return max(boot, book.numbers.get(arm, -1) // NUMBERS_PER_BOOT + 1) * NUMBERS_PER_BOOT
-
-
-def check_journals(arm: str, number: int, epoch: str, histories: Iterable[History], *, new_epoch: bool = False) -> None:
-    """Check that the journals of an arm are those that its peers know.
-
-    Args:
-        number: As `first_number` returns it.
-        new_epoch: Whether a person has requested that the arm begins without the journals that its peers know.
-
-    Raises:
-        BusError: they are lost, older copies, or of another epoch: jobs might be done twice.
-    """
-    for peer in (history for history in histories if history.arm != arm):
-        claimed = peer.claims.get(arm, -1)
-        if "" not in (epoch, peer.epoch) and epoch != peer.epoch:
-            raise BusError(
-                f"The journals of '{arm}' are of the epoch '{epoch}', but {describe(peer)}. Jobs could be done twice. "
-                "Bring the right journals back, or put these aside and start the arm with --new-epoch."
-            )
-        lost = claimed >= number or (claimed >= 0 and peer.epoch and not epoch)
-        if lost and not new_epoch:
-            raise BusError(
-                f"'{peer.arm}' knows claims of '{arm}' that its journals do not: they are lost, or older copies; "
-                f"{describe(peer)}. {REMEDY}"
-            )
-
-
-def history_of(arm: str, book: JobBook) -> History:
-    """Return the finished jobs, and those with permission to commit, as many as one message holds."""
-    reason = f"The journals of its arm were lost; '{arm}' had granted it permission to commit."
-    committed = tuple(
-        JobOutcome(entry.name, entry.award, grant.record.arm, "unfinished", entry.cycles, book.time_s, reason)
-        for entry in book.jobs.values()
-        if (grant := entry.grant) is not None and grant.may_commit
-    )[:MOST_JOBS]
-    history = History(arm, book.epoch, (), claims=dict(book.numbers), committed=committed)
-    size, finished = len(encode(history)), list[JobSpec]()
-    for name in [name for name in book.in_order if book.is_finished(name)][-MOST_FINISHED:]:
-        if (job := book.jobs[name].original) is not None and (size := size + len(encode(job)) + 1) <= MAX_BYTES:
-            finished.append(job)
-    return replace(history, finished=tuple(finished))
-
+from fleet.live.records import BookRecord
 
 _LOG = logging.getLogger(__name__)
 
@@ -106,6 +40,11 @@ LAST_S = 10.0
 """Real seconds after the end of the shift that an arm waits at most for last cycles, its own and its peers'."""
 NOT_YET_S = 1e9
 """Real seconds until the fleet's time would begin if no arm started it: never."""
+
+
+def first_number(arm: str, boot: int, book: JobBook) -> int:
+    """Return the number after which the claims and bids of a start of an arm are counted."""
+    return max(boot, book.numbers.get(arm, -1) // NUMBERS_PER_BOOT + 1) * NUMBERS_PER_BOOT
 
 
 class ConsensusNode(JobDesk):
@@ -222,7 +161,7 @@ class ConsensusNode(JobDesk):
         if known >= number or (known >= 0 and not self._epoch):
             _LOG.warning("Arm '%s' adopts what %d arm(s) have done and have.", self._name, len(histories))
             for history in (each for each in histories if each.arm != self._name):
-                granter.adopt(self.book.adopted(history), time.monotonic())
+                granter.adopt(adopted(self.book, history), time.monotonic())
             self.participant.count_after(known)
 
     def _ask_peers(self, real_s: float) -> None:
@@ -252,7 +191,7 @@ class ConsensusNode(JobDesk):
             self._begin(real_s)
         if self._begun:
             self._offer_jobs(time_s)
-            if time_s >= self._membership.horizon_s and not self.book.ended:
+            if time_s >= self._membership.horizon_s and math.isinf(self._ended_s):
                 self._end(real_s, time_s)
             self.participant.set_present(frozenset(self._tokens))
             self.participant.tick(real_s, time_s)
@@ -264,15 +203,12 @@ class ConsensusNode(JobDesk):
     def _offer_jobs(self, time_s: float) -> None:
         """Add the jobs of the stream that are due, as many as the disk has space for."""
         due = [job for at_s, job in self._stream if at_s <= time_s]
-        if not due:
-            return
         try:
             self.participant.granter.add_jobs(due)
         except JournalFull as error:
             self._warn("jobs", f"cannot record jobs that are due: {error}")
-        else:
-            for _ in due:
-                self._stream.popleft()
+        while self._stream and self.book.is_known(self._stream[0][1].name):
+            self._stream.popleft()
 
     def _begin(self, real_s: float) -> None:
         """Start the fleet's time, unless a peer has started it."""

@@ -29,22 +29,16 @@ from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import ALL_ARMS, Controlled, ControlRequest, Operation
 from fleet.live.arm.node import ArmNode
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
-from fleet.live.auction.rounds import (
-    NOT_OFFERED,
-    Bidding,
-    Choice,
-    Timing,
-    no_arm_can,
-    reason_to_wait,
-    resolve_claims,
-)
-from fleet.live.book import JobEntry, ShiftEnded, requested_job
+from fleet.live.auction.rounds import NOT_OFFERED, Bidding, Choice, no_arm_can, reason_to_wait, resolve_claims
 from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Claimant, Granter
 from fleet.live.job_rules import MAX_OPEN_JOBS as MAX_NOTES
 from fleet.live.job_rules import SHIFT_ENDED, finish_s, job_order, joined_reasons, why_not_ready, with_terms
+from fleet.live.leases import Timing, expire
 from fleet.live.monitor.snapshot import FRESH_S
+from fleet.live.records import JobEntry, ShiftEnded, requested_job
 from fleet.live.sensors import ArmSensors
 from fleet.live.space import Excludes, no_conflicts
+from fleet.live.steering import carry_out, controlled
 from fleet.observation import Observation
 
 _LOG = logging.getLogger(__name__)
@@ -204,20 +198,20 @@ class Participant:
         return self.granter.answer_claim(claim, real_s)
 
     def control(self, request: ControlRequest, time_s: float, later: Iterable[JobSpec] = ()) -> Controlled:
-        """Carry out a request of a person, as `JobBook.carry_out`; the peers get it.
+        """Carry out a request of a person, as `carry_out`; the peers get it.
 
         Args:
             later: Jobs that are not offered yet.
         """
         job = requested_job(request)
         self.granter.add_jobs(each for each in later if each.name == job)
-        operation, note = self.book.carry_out(request, self.granter.roster, time_s)
+        operation, note = carry_out(self.book, request, self.granter.roster, time_s)
         if operation is not None:
             if (outcome := self.granter.known_outcome(job)) is not None:
                 self.claimant.send_outcome(outcome)
             self.claimant.send_operation(operation)
             self.out.append(operation)
-        return self.book.controlled(request, note, next(iter(self._statuses([job])), None))
+        return controlled(self.book, request, note, next(iter(self._statuses([job])), None))
 
     # Time
 
@@ -240,7 +234,7 @@ class Participant:
     def _obey(self, real_s: float) -> None:
         """Apply operator requests to uncommitted jobs, end leases, and give up jobs that have expired."""
         book, cancelled = self.book, self.book.operations.cancelled
-        book.expire(real_s, self._time_s)
+        expire(book, real_s, self._time_s)
         book.try_to_record("Late jobs are not given up", *book.expired(self._time_s))
         if book.operations.latest:
             paused = book.is_paused(self.name)

@@ -27,8 +27,8 @@ from fleet.bus.protocol.messages import State
 from fleet.bus.router import Router
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.rounds import Assignment
-from fleet.live.book import BookRecord, salvage
 from fleet.live.journal import Journal, quarantine
+from fleet.live.records import BookRecord, salvage
 from tests.waiting import PATIENCE_S
 
 

@@ -33,6 +33,7 @@ from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.node import AuctionNode
 from fleet.live.book import JobBook
+from fleet.live.doubts import replay
 from fleet.live.job_rules import status_reply
 from fleet.live.journal import EpochBegun, JobsAccepted, Journal
 from fleet.live.monitor.snapshot import FleetListener
@@ -223,14 +224,14 @@ def auctioneer_of(book: JobBook) -> Auctioneer:
 
 def test_a_restart_publishes_as_much_again_as_was_cached():
     """Or what a recorder had not yet received when the auctioneer ended is lost."""
-    before = auctioneer_of(JobBook().replay([EpochBegun("e")]))
+    before = auctioneer_of(replay(JobBook(), [EpochBegun("e")]))
     for start in range(0, 2 * HISTORY, 128):
         jobs = tuple(JobSpec(name=str(start + i), kind="hold", places=("rack",)) for i in range(128))
         before.book.record(JobsAccepted(jobs, "bob", 1.0))
     before.set_present(frozenset(["arm_0"]))
     for number in range(3):
         before.control(ControlRequest(str(number), Pause("arm_0"), "ann"), 2.0)
-    after = auctioneer_of(JobBook().replay(before.book.compact()))
+    after = auctioneer_of(replay(JobBook(), before.book.compact()))
     for kind in (Result, Operation):
         sent, again = ([message for message in each.out if isinstance(message, kind)] for each in (before, after))
         assert [message.number for message in sent] == list(range(len(sent)))

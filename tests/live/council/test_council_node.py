@@ -25,11 +25,11 @@ from fleet.live.arm.body import SimulatedBody
 from fleet.live.arm.estimator import Estimator, NominalPeaks
 from fleet.live.arm.node import ArmConfig, ArmNode
 from fleet.live.auction.knowledge import LiveFleet
-from fleet.live.auction.rounds import Timing
-from fleet.live.book import BookRecord
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.node import ConsensusNode, Membership
 from fleet.live.journal import Journal
+from fleet.live.leases import Timing
+from fleet.live.records import BookRecord
 from fleet.robot import ThermalLimits
 from scenarios.live.arm import refuse_auctioneer
 from tests.waiting import PATIENCE_S

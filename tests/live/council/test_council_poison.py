@@ -28,11 +28,11 @@ from fleet.bus.protocol.messages import State, encode
 from fleet.bus.protocol.operator import Cancel, Change, ClearRequest, ControlRequest, Operation, Pause, Resume, Settle
 from fleet.live.arm.awards import ArmHistory, AwardExecutor
 from fleet.live.auction.knowledge import LiveFleet
-from fleet.live.book import BookRecord
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
 from fleet.live.journal import Journal
+from fleet.live.records import BookRecord
 from tests.live.test_poison import GROWN_BYTES, SILENT_S, Wire, odd, resident
 from tests.profiles import examples
 
