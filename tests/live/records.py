@@ -1,5 +1,7 @@
 """Records of a job book, made by few words."""
 
+from typing import Any
+
 from fleet.bus.protocol.auction import Report
 from fleet.bus.protocol.operator import Action, ControlRequest, Operation
 from fleet.live.journal import Released
@@ -11,7 +13,7 @@ def awarded(award: str, job: str, arm: str = "arm_0", cycles: int = 0, *, place:
 
 
 def closed(
-    award: str, outcome: str, cycles: int, time_s: float, reason: str = "", *, job="", arm="arm_0", **more: bool
+    award: str, outcome: Any, cycles: int, time_s: float, reason: str = "", *, job="", arm="arm_0", **more: bool
 ) -> BookRecord:
     """The end of an award; `unsure` and `faulted` as in `Report`."""
     job = job or award.partition(":")[2]
