@@ -20,7 +20,7 @@ def check_steering(sent: Sent, states: Mapping[str, str], jobs: Mapping[str, Any
 
     Args:
         states: State of every job at the end.
-        jobs: Entries of the ledger.
+        jobs: Entries of the job book.
 
     Raises:
         Violation: a rule is broken.

@@ -148,7 +148,7 @@ def run_auctioneer(scenario: Scenario, name: str, spec: LiveSpec, endpoint: str)
         if node.book.jobs:
             so_far = summary(node.auctioneer.status(), node.time_s, node.book.left).partition("\n")[0]
             _LOG.warning("Continuing from %s: %s", book.path, so_far)
-        if node.auctioneer.book.ended:
+        if node.book.ended:
             _LOG.warning("That shift is over; another --journal (of thermofleet up: --out) begins a new one.")
         if own:
             submit_stream(node, own, scenario.horizon_s, stop)
@@ -163,7 +163,7 @@ def submit_stream(
     node: AuctionNode, stream: Sequence[tuple[float, JobSpec]], horizon_s: float, stop: StopRequest
 ) -> None:
     """Serve, and submit a stream of jobs as they are released, until all are settled or the shift is over."""
-    left = [] if node.auctioneer.book.ended else list(stream)
+    left = [] if node.book.ended else list(stream)
     while not stop.is_set():
         node.serve(time.monotonic() + TURN_S)
         due = tuple(job for at_s, job in left if at_s <= node.time_s)
@@ -175,10 +175,10 @@ def submit_stream(
                 del left[: len(due)]
             except Refused as error:
                 _LOG.error("Could not submit the scenario's jobs; retrying: %s", error)
-        over = node.time_s >= horizon_s and not node.auctioneer.book.ended
+        over = node.time_s >= horizon_s and not node.book.ended
         if over:
             node.end()
-        if over or not (left or node.auctioneer.book.unsettled()):
+        if over or not (left or node.book.unsettled()):
             break
     first_s, last_s = (time.monotonic() + farewell_s for farewell_s in FAREWELL_S)
     while not stop.is_set() and time.monotonic() < (last_s if node.auctioneer.finishing() else first_s):

@@ -252,11 +252,11 @@ class Auctioneer:
 
     def _permit_commits(self, leased: dict[str, LeaseEntry], time_s: float) -> bool:
         """Record permissions to commit, and contact with silent arms; return whether that is on disk."""
-        renewals = (
+        needed = (
             renewal(self.book, award, time_s, entry.cycles, finishing=entry.phase == "finishing")
             for award, entry in leased.items()
         )
-        records = [record for renewal in renewals for record in renewal]
+        records = [record for each in needed for record in each]
         return self.book.try_to_record("No permission to commit is given", *records)
 
     def _take_space(self, arm: str, space: set[str]) -> None:
