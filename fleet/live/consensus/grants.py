@@ -26,7 +26,7 @@ from fleet.job import reason_to_give_up
 from fleet.live.arm.awards import REVOKED, ActiveAward, AwardExecutor
 from fleet.live.book import MAX_SETTLED, JobBook
 from fleet.live.job_rules import MAX_OPEN_JOBS
-from fleet.live.journal import EpochBegun, JobsAccepted, Progress, Released, SpaceTaken
+from fleet.live.journal import JobsAccepted, Progress, Released, SpaceTaken
 from fleet.live.leases import Timing, clear, expire, renewal
 from fleet.live.records import (
     BookRecord,
@@ -183,14 +183,6 @@ class Granter:
         self.book.record(*records)
         for award in self.book.open.keys() - self.book.leases.keys():
             self.book.leases[award] = CountedLease(real_s + self.timing.counted_lease_s)
-
-    def begin_epoch(self, epoch: str) -> None:
-        """Record the name of the shift.
-
-        Raises:
-            JournalError: it is not on disk.
-        """
-        self.book.record(EpochBegun(epoch))
 
     # Inside
 

@@ -27,7 +27,7 @@ from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Granter
 from fleet.live.consensus.participant import QUIET_S, Membership, Participant
 from fleet.live.desk import JobDesk
 from fleet.live.epochs import REPLY_S, adopted, ask_arms, check_journals, history_of
-from fleet.live.journal import Journal, Started, TimeRecorder, own_records
+from fleet.live.journal import EpochBegun, Journal, Started, TimeRecorder, own_records
 from fleet.live.records import BookRecord
 
 _LOG = logging.getLogger(__name__)
@@ -269,7 +269,7 @@ class ConsensusNode(JobDesk):
         """Take the epoch of the fleet, unless there is one on disk already; return whether it is this one."""
         if epoch and not self._epoch:
             try:
-                self.participant.granter.begin_epoch(epoch)
+                self.book.record(EpochBegun(epoch))
             except Refused as error:
                 self._warn("epoch", f"cannot record the epoch: {error}")
         elif epoch not in ("", self._epoch):
@@ -285,7 +285,7 @@ class ConsensusNode(JobDesk):
     def _answer_claim(self, claim: Claim) -> ClaimReply:
         if claim.arm == self._name or not self._begun:
             raise AnotherReplies
-        return self.participant.answer_claim(claim, time.monotonic())
+        return self.participant.granter.answer_claim(claim, time.monotonic())
 
     # Requests of others: all arms receive them, and the first present one replies
 

@@ -13,7 +13,6 @@ Safety rests on step 4 alone (`fleet.live.consensus.grants`). Steps 1 to 3 only 
 job: where messages are lost two arms may claim one, and the one without a majority waits and tries again.
 """
 
-import logging
 import math
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable
@@ -24,14 +23,14 @@ from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import NOT_PLANNED, SETTLED, JobSpec, JobStatus, Quote
 from fleet.bus.protocol.cell import Cell
-from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
+from fleet.bus.protocol.consensus import Bid, Claim
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import ALL_ARMS, Controlled, ControlRequest, Operation
 from fleet.live.arm.node import ArmNode
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.rounds import NOT_OFFERED, Bidding, Choice, no_arm_can, reason_to_wait, resolve_claims
+from fleet.live.book import MAX_UNKNOWN
 from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Claimant, Granter
-from fleet.live.job_rules import MAX_OPEN_JOBS as MAX_NOTES
 from fleet.live.job_rules import SHIFT_ENDED, finish_s, job_order, joined_reasons, why_not_ready, with_terms
 from fleet.live.leases import Timing, expire
 from fleet.live.monitor.snapshot import FRESH_S
@@ -40,8 +39,6 @@ from fleet.live.sensors import ArmSensors
 from fleet.live.space import Excludes, no_conflicts
 from fleet.live.steering import carry_out, controlled
 from fleet.observation import Observation
-
-_LOG = logging.getLogger(__name__)
 
 QUIET_S = 0.05
 """Real seconds without a new bid or choice, after which all arms most likely have the same bids."""
@@ -163,7 +160,7 @@ class Participant:
         for offer in bid.estimates:
             by_arm = self._refusals.setdefault(offer.job, {})
             by_arm[bid.arm] = "" if offer.feasible else offer.reason or "infeasible"
-        while len(self._refusals) > MAX_NOTES:
+        while len(self._refusals) > MAX_UNKNOWN:
             del self._refusals[next(iter(self._refusals))]
 
     def _send_corrections(self, bid: Bid, real_s: float) -> None:
@@ -188,14 +185,6 @@ class Participant:
         for job in self.open_jobs():
             if job not in bid.open_jobs and (spec := book.jobs[job].original) is not None and job_order(spec) < end:
                 self.claimant.send_job(spec)
-
-    def answer_claim(self, claim: Claim, real_s: float) -> ClaimReply:
-        """Return the reply to a peer's claim.
-
-        Raises:
-            Refused: as `Granter.answer_claim`.
-        """
-        return self.granter.answer_claim(claim, real_s)
 
     def control(self, request: ControlRequest, time_s: float, later: Iterable[JobSpec] = ()) -> Controlled:
         """Carry out a request of a person, as `carry_out`; the peers get it.
