@@ -31,7 +31,7 @@ from twin.logs.reader import GEN3, PLAIN, read
 
 logging.disable(logging.CRITICAL)
 KINDS = tuple(EXAMPLES)
-JOURNALS = (ArmRecord, BookRecord, BookRecord)
+JOURNALS = (ArmRecord, BookRecord)
 
 
 class Target(NamedTuple):

@@ -15,7 +15,7 @@ from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Operatio
 from fleet.errors import JournalError, Refused
 from fleet.live import journal as journal_module
 from fleet.live import steering as steering_module
-from fleet.live.arm.awards import ArmHistory, AwardAccepted, AwardExecutor
+from fleet.live.arm.awards import ArmHistory, AwardAccepted, AwardExecutor, Closed
 from fleet.live.auction import auctioneer as auctioneer_module
 from fleet.live.auction import rounds as round_module
 from fleet.live.auction.auctioneer import Auctioneer
@@ -25,7 +25,7 @@ from fleet.live.consensus import grants as grants_module
 from fleet.live.consensus import participant as participant_module
 from fleet.live.consensus.grants import Claimant, Granter
 from fleet.live.job_rules import PastJobs, content_hash
-from fleet.live.journal import Closed, CommitPermitted, JobsAccepted, Journal, Released
+from fleet.live.journal import CommitPermitted, JobsAccepted, Journal, Released
 from fleet.live.leases import Timing
 from fleet.live.records import Checked, Granted, JobSettled, Requested
 from fleet.live.supervisor import Supervisor

@@ -611,7 +611,6 @@ class JobBook(TimedState[BookRecord]):
 
     def _wait(self, entry: JobEntry, reason: str) -> list[JobEntry]:
         """Have a job wait again, unless it is abandoned; return what has changed."""
-        entry.count(entry.cycles)
         if entry.spec is not None:  # the last cycle is never assumed done
             entry.cycles = min(entry.cycles, entry.spec.repetitions - 1)
         if not entry.aside and (lost := self._reason_to_abandon(entry)) is not None:
@@ -755,7 +754,8 @@ class JobBook(TimedState[BookRecord]):
         elif entry.aside:
             state, reason = "unfinished", reason_of_aside(entry.aside)
         elif state == "waiting" and self.ended:
-            state, reason = "unfinished", reason or SHIFT_ENDED
+            known = entry.reason if entry.state == "unfinished" else reason
+            state, reason = "unfinished", known or SHIFT_ENDED
         self.waiting.pop(entry.name, None)
         self._unsettle(entry)
         entry.state, entry.reason = state, reason

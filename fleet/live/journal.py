@@ -399,23 +399,6 @@ class Released(msgspec.Struct, frozen=True, tag="released"):
     reason: str = ""
 
 
-class Closed(msgspec.Struct, frozen=True, tag="closed"):
-    """An award has ended."""
-
-    award: Name
-    outcome: Literal["finished", "returned"]
-    cycles: Count
-    """Done so far, by any arm."""
-    time_s: float
-    reason: str = ""
-    unsure: bool = False
-    """As in `fleet.bus.protocol.auction.Report`."""
-    job: str = ""
-    arm: str = ""
-    faulted: bool = False
-    """As in `fleet.bus.protocol.auction.Report`."""
-
-
 class SpaceTaken(msgspec.Struct, frozen=True, tag="space_taken"):
     """Spaces that an arm takes, by its own report; empty at home."""
 
@@ -466,7 +449,7 @@ def own_records(journal: Journal[Record], name: str) -> Iterator[Record]:
     """Yield the records of the journal of an arm or auctioneer, oldest first.
 
     Raises:
-        JournalError: it is of another one, or damaged. Journals of earlier versions may name none.
+        JournalError: it is of another one, or damaged.
     """
     for record in journal.records():
         if isinstance(record, Started) and record.name not in ("", name):

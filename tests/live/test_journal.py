@@ -11,18 +11,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.bus.protocol.auction import Award, JobSpec
+from fleet.bus.protocol.auction import Award, JobSpec, Report
 from fleet.bus.protocol.messages import encode
 from fleet.errors import FleetError, JournalError, JournalFull
 from fleet.live import journal
-from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, JobsFinished, ReportReceived
+from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, Closed, JobsFinished, ReportReceived
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.node import AuctionNode
 from fleet.live.book import JobBook
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
 from fleet.live.doubts import replay
-from fleet.live.journal import Closed, CommitPermitted, CompactingJournal, Journal, Started, TimeRecorder
+from fleet.live.journal import CommitPermitted, CompactingJournal, Journal, Started, TimeRecorder
 from fleet.live.records import BookRecord
 from scenarios.live.arm import restart_history
 from tests.live.council.test_council_poison import Arm
@@ -336,7 +336,7 @@ def test_the_journal_of_an_arm_stays_short_while_it_is_written(tmp_path, monkeyp
             award = Award(f"award {number}", "round", "auctioneer", "quote", job, epoch=f"{number // 1500}")
             records = [AwardAccepted(award), CommitPermitted(award.award)]
             if number < 1999:
-                records += [Closed(award.award, "finished", 1, 1.0, job=job.name, arm="a"), ReportReceived(award.award)]
+                records += [Closed(Report("a", award.award, job.name, "finished", 1, 1.0)), ReportReceived(award.award)]
             kept.append(*records)
             whole.replay(records)
             sizes.append(path.stat().st_size)

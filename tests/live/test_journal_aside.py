@@ -12,16 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.simulation.participants import AUCTIONEER, simulated_system
-from fleet.bus.protocol.auction import Award, JobSpec
+from fleet.bus.protocol.auction import Award, JobSpec, Report
 from fleet.bus.protocol.consensus import History
 from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Pause, Resume, Settle
 from fleet.errors import JournalError, Refused
 from fleet.live import journal as journal_module
-from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, ReportReceived
+from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, Closed, ReportReceived
 from fleet.live.book import JobBook
 from fleet.live.doubts import replay
 from fleet.live.epochs import adopted
-from fleet.live.journal import ClockTick, Closed, CommitPermitted, JobsAccepted, Journal, Progress, Started, quarantine
+from fleet.live.journal import ClockTick, CommitPermitted, JobsAccepted, Journal, Progress, Started, quarantine
 from fleet.live.leases import expire
 from fleet.live.records import BookRecord, Checked, salvage
 from fleet.live.steering import objection
@@ -268,7 +268,7 @@ def test_one_wrong_record_in_the_journal_of_an_arm_does_not_stop_it(boots, kind,
         CommitPermitted("r:a"),
         AwardAccepted(other),
     ]
-    records += [Closed("r:a", "finished", 3, 2.0, job="a", arm="arm_0"), ReportReceived("r:a"), Progress("b", 2)]
+    records += [Closed(Report("arm_0", "r:a", "a", "finished", 3, 2.0)), ReportReceived("r:a"), Progress("b", 2)]
     journal = wrong_journal(records, kind, index % len(records), rng, ArmRecord)
     if journal is None:
         return

@@ -40,7 +40,7 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.consensus import MOST_FINISHED, History, with_finished
 from fleet.errors import JournalFull
 from fleet.live.clock import CLOCK_DRIFT
-from fleet.live.journal import Closed, CommitPermitted, JournalState, Progress, Released, Started
+from fleet.live.journal import CommitPermitted, JournalState, Progress, Released, Started
 
 MAX_PAST_AWARDS = 256
 """Closed awards whose answer is kept; their quotes expired long ago."""
@@ -52,6 +52,12 @@ class AwardAccepted(msgspec.Struct, frozen=True, tag="award_accepted"):
     """The arm accepted a job."""
 
     award: Award
+
+
+class Closed(msgspec.Struct, frozen=True, tag="closed"):
+    """An award has ended, and is reported."""
+
+    report: Report
 
 
 class ReportReceived(msgspec.Struct, frozen=True, tag="report_received"):
@@ -141,7 +147,7 @@ class ArmHistory(JournalState[ArmRecord]):
     finished: dict[str, JobSpec] = field(default_factory=dict[str, JobSpec])
     """The last jobs that the arm finished, oldest first."""
     name: str = ""
-    """Of the arm; "" in a journal of an earlier version."""
+    """Of the arm."""
 
     def apply(self, record: ArmRecord) -> None:
         """Change the history as the record says."""
@@ -159,12 +165,11 @@ class ArmHistory(JournalState[ArmRecord]):
             case CommitPermitted(name):
                 if name in self.active:
                     self.active[name].may_commit = True
-            case Closed(name):
-                if name in self.active:
-                    report = report_of(record)
-                    award = self.active.pop(name).award
-                    self.reports[name] = award, report
-                    if record.outcome == "finished":
+            case Closed(report):
+                if report.award in self.active:
+                    award = self.active.pop(report.award).award
+                    self.reports[report.award] = award, report
+                    if report.outcome == "finished":
                         self._finish(award.job)
             case Released(name):
                 self.active.pop(name, None)
@@ -192,7 +197,7 @@ class ArmHistory(JournalState[ArmRecord]):
         records += [JobsFinished(tuple(self.finished.values()), self.epoch)] if self.epoch or self.finished else []
         records += [PastAward(name, job) for name, job in self.accepted.items()]
         for award, report in self.reports.values():
-            records += [AwardAccepted(award), closed(report)]
+            records += [AwardAccepted(award), Closed(report)]
         for name, active in self.active.items():
             records += [AwardAccepted(active.award), Progress(active.job, active.cycles)]
             records += [CommitPermitted(name)] if active.may_commit else []
@@ -221,16 +226,6 @@ def bounded(accepted: dict[str, str], needed: Iterable[str]) -> dict[str, str]:
     keep = set(needed)
     keep.update([name for name in accepted if name not in keep][-MAX_PAST_AWARDS:])
     return {name: job for name, job in accepted.items() if name in keep}
-
-
-def closed(report: Report) -> Closed:
-    """Journal record of a report."""
-    return msgspec.convert(report, Closed, from_attributes=True)
-
-
-def report_of(record: Closed) -> Report:
-    """Report that a journal record was made of."""
-    return msgspec.convert(record, Report, from_attributes=True)
 
 
 _LOG = logging.getLogger(__name__)
@@ -503,7 +498,7 @@ class AwardExecutor:
         report = Report(self.arm, name, active.job, outcome, active.cycles, time_s, reason, faulted=faulted)
         del self._active[name]
         self._reports[name] = _PendingReport(active.award.auctioneer, report, now_s)
-        self.write(closed(report))
+        self.write(Closed(report))
 
     # Leases
 
@@ -590,7 +585,7 @@ class AwardExecutor:
     # The disk
 
     def _unwritten_reports(self) -> set[str]:
-        return {record.award for record in self.unwritten if isinstance(record, Closed)}
+        return {record.report.award for record in self.unwritten if isinstance(record, Closed)}
 
     def write(self, record: ArmRecord) -> None:
         """Write what has already happened; without space on the disk, later."""

@@ -130,7 +130,7 @@ def bus(tmp_path, small):
                 kill(name)
             for path in tmp_path.glob("*.journal"):
                 with Journal(path, ArmRecord) as book:
-                    closed = [each for each in book.records() if isinstance(each, Closed)]
+                    closed = [each.report for each in book.records() if isinstance(each, Closed)]
                 done.update(report.job for report in closed if report.outcome == "finished")
             return done
 
