@@ -29,9 +29,9 @@ from fleet.bus.protocol.messages import State, encode
 from fleet.bus.router import open_client
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.node import AuctionNode
-from fleet.live.auction.records import AuctionRecord
-from fleet.live.auction.rounds import Timing
 from fleet.live.journal import Journal
+from fleet.live.leases import Timing
+from fleet.live.records import BookRecord
 from scenarios.live.auctioneer import CentralAllocation
 from scenarios.policy_loader import policy_at
 
@@ -126,7 +126,7 @@ def ours(endpoint: str, folder: Path, given: Namespace) -> tuple[list[tuple[int,
     # Enough jobs to keep the number of offers constant until the last batch.
     work = job_specs(given.arms * given.batches + given.jobs)
     allocate = CentralAllocation(policy_at(given.policy, 0), LiveFleet(arms=()))
-    with BusClient(endpoint, FLEET) as link, Journal[AuctionRecord](folder / "bench.journal", AuctionRecord) as book:
+    with BusClient(endpoint, FLEET) as link, Journal[BookRecord](folder / "bench.journal", BookRecord) as book:
         node = AuctionNode(link, "auctioneer", book, allocate=allocate, speed=1.0, timing=timing)
         deadline_s = time.monotonic() + PATIENCE_S
         while len(node.present) < given.arms and time.monotonic() < deadline_s:

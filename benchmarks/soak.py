@@ -35,11 +35,13 @@ from fleet.bus.protocol.auction import (
     Submission,
 )
 from fleet.live.auction.auctioneer import Auctioneer
-from fleet.live.auction.job_rules import MAX_OPEN_JOBS
-from fleet.live.auction.ledger import Ledger
-from fleet.live.auction.records import AuctionRecord
-from fleet.live.auction.rounds import Assignment, Bidding, SendAward, Timing
+from fleet.live.auction.rounds import Assignment, Bidding
+from fleet.live.book import JobBook
+from fleet.live.doubts import replay
+from fleet.live.job_rules import MAX_OPEN_JOBS
 from fleet.live.journal import EpochBegun, Journal, TimeRecorder
+from fleet.live.leases import Timing
+from fleet.live.records import BookRecord, SendAward
 
 WEEK_S = 7 * 24 * 3600.0
 BATCH, BACKLOG = 10, 200
@@ -60,7 +62,7 @@ class Sample:
     rss_mb: float
     journal_mb: float
     kept_jobs: int
-    """In the ledger, settled ones included."""
+    """In the book, settled ones included."""
     submit_p50_ms: float
     submit_p99_ms: float
 
@@ -87,15 +89,15 @@ def first_come(bidding: Bidding) -> dict[str, Assignment]:
 class Week:
     """An auctioneer and its arms, which do everything at once."""
 
-    def __init__(self, journal: Journal[AuctionRecord], disk: Disk, arms: int, jobs: int) -> None:
+    def __init__(self, journal: Journal[BookRecord], disk: Disk, arms: int, jobs: int) -> None:
         self.arms = tuple(f"arm_{number}" for number in range(arms))
         self.real_s, self._disk, self._left, self._made = 0.0, disk, jobs, 0
-        ledger = Ledger().replay(journal.records())
-        self._recorder = TimeRecorder(journal, ledger, 0.0)
+        book = replay(JobBook(), journal.records())
+        self._recorder = TimeRecorder(journal, book, 0.0)
         journal.append(EpochBegun("soak"))
         self.auctioneer = Auctioneer(
             "auctioneer",
-            ledger,
+            book,
             allocate=first_come,
             keep=journal.append,
             boot="1",
@@ -125,7 +127,7 @@ class Week:
 
     def step(self) -> None:
         """Run one round, and finish what it awards."""
-        while self._made < self._left and len(self.auctioneer.ledger.waiting) < BACKLOG:
+        while self._made < self._left and len(self.auctioneer.book.waiting) < BACKLOG:
             self.submit()
         self.real_s += self._step_s
         out = self.auctioneer.out
@@ -148,7 +150,7 @@ class Week:
         now_s, auctioneer = self.real_s, self.auctioneer
         auctioneer.apply_ack(Ack(arm, award, True), now_s, now_s)
         self.done += 1
-        if self.done % 50 == 0 and auctioneer.ledger.jobs[job].returns == 0:
+        if self.done % 50 == 0 and auctioneer.book.jobs[job].returns == 0:
             self.done -= 1
             auctioneer.apply_report(Report(arm, award, job, "returned", 0, now_s, "too hot"), now_s, now_s)
             return
@@ -158,41 +160,41 @@ class Week:
     @property
     def over(self) -> bool:
         """Whether all jobs are settled."""
-        return self._made >= self._left and not self.auctioneer.ledger.unsettled()
+        return self._made >= self._left and not self.auctioneer.book.unsettled()
 
 
 def soak(path: Path, jobs: int, arms: int) -> tuple[list[Sample], int]:
     """Run the week; return samples over time, and the number of jobs that are missing at the end."""
     disk, samples, start_s = Disk(), list[Sample](), time.monotonic()
-    with Journal[AuctionRecord](path, AuctionRecord, sync=disk.sync) as journal:
+    with Journal[BookRecord](path, BookRecord, sync=disk.sync) as journal:
         week = Week(journal, disk, arms, jobs)
-        ledger, each = week.auctioneer.ledger, max(1, jobs // SAMPLES)
+        book, each = week.auctioneer.book, max(1, jobs // SAMPLES)
         while not week.over:
             week.step()
             if week.done >= each * (len(samples) + 1):
                 p50, p99 = np.quantile(week.submit_s or [np.nan], [0.5, 0.99]) * 1e3
                 week.submit_s.clear()
                 size = path.stat().st_size / 1e6
-                kept = len(ledger.jobs)
+                kept = len(book.jobs)
                 row = (week.done, time.monotonic() - start_s, rss_mb(), size, kept, float(p50), float(p99))
                 samples.append(Sample(*row))
                 if len(samples) % 20 == 0:
                     print(json.dumps(asdict(samples[-1])), flush=True)
-        return samples, jobs - len(ledger.settled) - sum(ledger.left.values())
+        return samples, jobs - len(book.settled) - sum(book.left.values())
 
 
 def restart_s(folder: Path) -> float:
     """Return the start-up time of an auctioneer with the largest number of open jobs, s."""
     path = folder / "open.journal"
-    with Journal[AuctionRecord](path, AuctionRecord, sync=lambda file: None) as journal:
+    with Journal[BookRecord](path, BookRecord, sync=lambda file: None) as journal:
         week = Week(journal, Disk(), 4, MAX_OPEN_JOBS)
         for _ in range(MAX_OPEN_JOBS // BATCH):
             week.submit()
     start_s = time.perf_counter()
-    with Journal[AuctionRecord](path, AuctionRecord) as journal:
+    with Journal[BookRecord](path, BookRecord) as journal:
         week = Week(journal, Disk(), 4, 1)
         took_s = time.perf_counter() - start_s
-        assert len(week.auctioneer.ledger.waiting) == MAX_OPEN_JOBS
+        assert len(week.auctioneer.book.waiting) == MAX_OPEN_JOBS
     return took_s
 
 

@@ -16,9 +16,9 @@ from fleet.engine.batch import RewardWeights
 from fleet.events import MEANINGS
 from fleet.job import BOUNDS, LONGEST_GRASP_S, LONGEST_JOB_S
 from fleet.live.arm.awards import COMMIT_RETRY_S, RENEWALS, REPORT_RETRY_S, ExecutorConfig
-from fleet.live.auction.job_rules import MAX_OPEN_JOBS
-from fleet.live.auction.rounds import Timing
 from fleet.live.clock import CLOCK_DRIFT
+from fleet.live.job_rules import MAX_OPEN_JOBS
+from fleet.live.leases import Timing
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.observation import FIELDS, Layout
 from scenarios.cli.main import COMMANDS, load_command

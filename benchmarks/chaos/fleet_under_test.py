@@ -252,8 +252,8 @@ class JournalFiles:
         for files in self._files.values():
             for file in files:
                 for record in _records(file):
-                    if isinstance(record, Closed) and record.outcome == "finished":
-                        ended.add((record.job, record.award))
+                    if isinstance(record, Closed) and record.report.outcome == "finished":
+                        ended.add((record.report.job, record.report.award))
                     elif isinstance(record, JobsFinished):
                         named.update(job.name for job in record.jobs)
         done = Counter(job for job, _ in ended)

@@ -19,10 +19,10 @@ from fleet.bus.security.tls import Tls
 from fleet.job import Work
 from fleet.live.arm.awards import ArmRecord
 from fleet.live.auction.knowledge import LiveFleet
-from fleet.live.auction.ledger import AuctionRecord
 from fleet.live.auction.node import AuctionNode
-from fleet.live.auction.rounds import Timing
 from fleet.live.journal import Journal
+from fleet.live.leases import Timing
+from fleet.live.records import BookRecord
 from scenarios.live.arm import PreparedArm, make_node, simulated_arm
 from scenarios.live.auctioneer import CentralAllocation
 from scenarios.policy_loader import policy_at
@@ -57,7 +57,7 @@ def auction(endpoint: str, journals: Path, arms: int, speed: float, stop: StopRe
     """Run the auctioneer."""
     with (
         BusClient(endpoint, FLEET, stopped=stop.is_set) as link,
-        Journal[AuctionRecord](journals / "auctioneer.journal", AuctionRecord) as book,
+        Journal[BookRecord](journals / "auctioneer.journal", BookRecord) as book,
     ):
         known = LiveFleet(arms=names_of(arms), limits=load(SCENARIO).limits)
         allocate = CentralAllocation(policy_at("quickest_matching", 0), known)

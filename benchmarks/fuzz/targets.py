@@ -21,9 +21,8 @@ from fleet.bus.protocol.messages import MalformedMessage, decode, encode
 from fleet.bus.security.access_control import read_roster
 from fleet.errors import FleetError, visible
 from fleet.live.arm.awards import ArmHistory, ArmRecord
-from fleet.live.auction.ledger import AuctionRecord
-from fleet.live.consensus.jobs import GrantRecord
 from fleet.live.journal import Journal
+from fleet.live.records import BookRecord
 from scenarios.live.gateway import read_tokens
 from scenarios.live.requests import read_jobs
 from scenarios.spec.load import library
@@ -32,7 +31,7 @@ from twin.logs.reader import GEN3, PLAIN, read
 
 logging.disable(logging.CRITICAL)
 KINDS = tuple(EXAMPLES)
-JOURNALS = (ArmRecord, AuctionRecord, GrantRecord)
+JOURNALS = (ArmRecord, BookRecord)
 
 
 class Target(NamedTuple):

@@ -6,7 +6,7 @@ from fleet.bus.protocol.auction import LEASE_S, Ack, Award, JobEstimate, JobSpec
 from fleet.bus.protocol.keys import STATE_HZ
 from fleet.bus.protocol.messages import State, encode
 from fleet.live.arm.awards import RENEWALS
-from fleet.live.auction.rounds import Timing
+from fleet.live.leases import Timing
 
 JOB_S = 340.0
 """Real seconds between two jobs of an arm: quickstart has one job in 85 s for four arms."""

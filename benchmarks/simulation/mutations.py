@@ -6,23 +6,28 @@ A patch replaces methods of the product's classes until the end of its `with` bl
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import UnionType
 from typing import Any, NamedTuple
 
 from msgspec.structs import replace as changed
 
-from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Pause, Resume, Settle
+from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Operation, Pause, Resume, Settle
 from fleet.errors import JournalError, Refused
 from fleet.live import journal as journal_module
-from fleet.live.arm.awards import ArmHistory, AwardAccepted, AwardExecutor
+from fleet.live import steering as steering_module
+from fleet.live.arm.awards import ArmHistory, AwardAccepted, AwardExecutor, Closed
 from fleet.live.auction import auctioneer as auctioneer_module
 from fleet.live.auction import rounds as round_module
 from fleet.live.auction.auctioneer import Auctioneer
-from fleet.live.auction.ledger import Ledger, LedgerView
-from fleet.live.auction.records import Awarded, Checked, Operated, PastJobs, content_hash
-from fleet.live.auction.rounds import LedgerWriter, Rounds, Timing
+from fleet.live.auction.rounds import Rounds
+from fleet.live.book import JobBook
+from fleet.live.consensus import grants as grants_module
+from fleet.live.consensus import participant as participant_module
 from fleet.live.consensus.grants import Claimant, Granter
-from fleet.live.consensus.jobs import JobGranted
-from fleet.live.journal import Closed, CommitPermitted, JobsAccepted, Journal
+from fleet.live.job_rules import PastJobs, content_hash
+from fleet.live.journal import CommitPermitted, JobsAccepted, Journal, Released
+from fleet.live.leases import Timing
+from fleet.live.records import Checked, Granted, JobSettled, Requested
 from fleet.live.supervisor import Supervisor
 from scenarios.live.recorder import GapFetcher, Recorder
 
@@ -62,7 +67,7 @@ def applied(name: str) -> Iterator[None]:
             setattr(owner, attribute, original)
 
 
-def unwritten(kind: type) -> Callable[[Any], Any]:
+def unwritten(kind: type | UnionType) -> Callable[[Any], Any]:
     """Journal whose records of one kind are not written, nor the checks that would notice it."""
 
     def make(append: Any) -> Any:
@@ -77,16 +82,7 @@ def unwritten(kind: type) -> Callable[[Any], Any]:
 def _forgetful(start: Any) -> Any:
     """Start without leases."""
 
-    return lambda self, name, ledger, keep, counted_until_s: start(self, name, ledger, keep, -math.inf)
-
-
-def _forgetful_granter(start: Any) -> Any:
-    def patched(self: Any, *arguments: Any, **options: Any) -> None:
-        start(self, *arguments, **options)
-        for grant in self.register.grants.values():
-            grant.until_s = options["real_s"]
-
-    return patched
+    return lambda self, keep, counted_until_s, *announce: start(self, keep, -math.inf, *announce)
 
 
 def _duplicate(answer: Any) -> Any:
@@ -130,11 +126,11 @@ def _silent(report: Any) -> Any:
     """Send the receipt without a record."""
 
     def patched(self: Any, message: Any, real_s: float, time_s: float) -> Any:
-        self._writer.record = lambda *records: None
+        self.book.record = lambda *records: None
         try:
             return report(self, message, real_s, time_s)
         finally:
-            del self._writer.record
+            del self.book.record
 
     return patched
 
@@ -142,16 +138,18 @@ def _silent(report: Any) -> Any:
 def _expires_all(expire: Any) -> Any:
     """Take a job back although its arm was permitted to commit."""
 
-    def patched(self: Any, real_s: float, time_s: float) -> None:
-        for name in [name for name, lease in self._writer.leases.items() if real_s >= lease.until_s]:
-            self._writer.record(Closed(name, "dropped", 0, time_s, "mutation"))
+    def patched(book: Any, real_s: float, time_s: float) -> bool:
+        for name in [name for name, lease in book.leases.items() if real_s >= lease.until_s]:
+            grant = book.open[name].record
+            book.record(Released(name, grant.job, grant.arm, "dropped", 0, time_s, "mutation"))
+        return False
 
     return patched
 
 
 def _ends_free(end: Any) -> Any:
     """Free the space of a closed award at once."""
-    return lambda self, award, *, moved=True: end(self, award, moved=False)
+    return lambda self, grant, outcome, *, moved=True: end(self, grant, outcome, moved=False)
 
 
 def _reads_torn_lines(lines: Any) -> Any:
@@ -171,7 +169,7 @@ def _nobody_in_the_way(original: Any) -> Any:
 
 
 add_mutation(
-    "award-unwritten", "an award is on disk before it is sent", (Journal, "append", unwritten(Awarded)), alone=False
+    "award-unwritten", "an award is on disk before it is sent", (Journal, "append", unwritten(Granted)), alone=False
 )
 add_mutation(
     "commit-unwritten",
@@ -181,12 +179,12 @@ add_mutation(
 add_mutation("accept-unwritten", "an arm accepts an award on disk", (Journal, "append", unwritten(AwardAccepted)))
 add_mutation("submission-unwritten", "an accepted job is on disk", (Journal, "append", unwritten(JobsAccepted)))
 add_mutation(
-    "grant-unwritten", "a grant is on disk before the reply", (Journal, "append", unwritten(JobGranted)), alone=True
+    "grant-unwritten", "a grant is on disk before the reply", (Journal, "append", unwritten(Granted)), alone=True
 )
 add_mutation(
     "end-unwritten",
     "the end of a job is on disk before its report and receipt",
-    (Journal, "append", unwritten(Closed)),
+    (Journal, "append", unwritten(Closed | JobSettled)),
 )
 add_mutation(
     "no-fsync",
@@ -197,12 +195,10 @@ add_mutation("torn-line-read", "an unfinished last line is removed", (Journal, "
 add_mutation(
     "lease-forgotten",
     "after a restart open awards count as leased",
-    (LedgerWriter, "__init__", _forgetful),
+    (JobBook, "attach", _forgetful),
     alone=False,
 )
-add_mutation(
-    "grant-forgotten", "after a restart grants count as leased", (Granter, "__init__", _forgetful_granter), alone=True
-)
+add_mutation("grant-forgotten", "after a restart grants count as leased", (JobBook, "attach", _forgetful), alone=True)
 add_mutation(
     "lease-too-short",
     "the granting side counts leases longer",
@@ -232,8 +228,7 @@ add_mutation(
 add_mutation(
     "commit-taken-back",
     "after permission to commit a job goes to no other arm",
-    (Auctioneer, "_expire", _expires_all),
-    alone=False,
+    *((module, "expire", _expires_all) for module in (auctioneer_module, grants_module, participant_module)),
 )
 add_mutation(
     "duplicate-accepted",
@@ -261,7 +256,7 @@ add_mutation(
 add_mutation(
     "space-freed-early",
     "closed awards keep their space until the arm is at home",
-    (Ledger, "_end", _ends_free),
+    (JobBook, "_end", _ends_free),
     alone=False,
 )
 add_mutation(
@@ -290,7 +285,7 @@ add_mutation(
 add_mutation(
     "no-backstop",
     "an unanswered award is sent again, or expires",
-    (Auctioneer, "_expire", lambda _: lambda self, real_s, time_s: None),
+    (auctioneer_module, "expire", lambda _: lambda book, real_s, time_s: False),
     alone=False,
 )
 
@@ -299,11 +294,11 @@ def _ignores(action: type) -> Callable[[Any], Any]:
     """Record a request of this kind, and change nothing."""
 
     def make(operate: Any) -> Any:
-        def patched(self: Any, record: Operated) -> Any:
-            if isinstance(record.request.action, action):
-                self.requests[record.request.request] = content_hash(record.request)
+        def patched(self: Any, operation: Operation) -> Any:
+            if isinstance(operation.request.action, action):
+                self.operations.names[operation.request.request] = content_hash(operation.request)
                 return []
-            return operate(self, record)
+            return operate(self, operation)
 
         return patched
 
@@ -313,9 +308,9 @@ def _ignores(action: type) -> Callable[[Any], Any]:
 def _redone_at_once(objection: Any) -> Any:
     """Redo a job although its arm may still do its last cycle."""
 
-    def patched(ledger: Any, request: ControlRequest, heard: Any) -> str:
+    def patched(book: Any, request: ControlRequest, arms: Any) -> str:
         try:
-            return objection(ledger, request, heard)
+            return objection(book, request, arms)
         except Refused as refused:
             if "may still do the last cycle" in str(refused):
                 return ""
@@ -327,15 +322,15 @@ def _redone_at_once(objection: Any) -> Any:
 def _cleared_at_once(clear: Any) -> Any:
     """Free the space of an absent arm that may have a lease."""
 
-    def patched(ledger: Any, *arguments: Any) -> Any:
-        before = {name: award.silent for name, award in ledger.open.items()}
+    def patched(book: Any, *arguments: Any) -> Any:
+        before = {name: grant.silent for name, grant in book.open.items()}
+        for grant in book.open.values():
+            grant.silent = True
         try:
-            for award in ledger.open.values():
-                award.silent = True
-            return clear(ledger, *arguments)
+            return clear(book, *arguments)
         finally:
-            for name, silent in before.items():
-                ledger.open[name].silent = silent
+            for name in before.keys() & book.open.keys():
+                book.open[name].silent = before[name]
 
     return patched
 
@@ -352,17 +347,20 @@ def _gaps_unnoticed(take: Any) -> Any:
 add_mutation(
     "request-unwritten",
     "a request of a person is on disk before the reply",
-    (Journal, "append", unwritten(Operated)),
+    (Journal, "append", unwritten(Requested)),
     alone=False,
 )
 add_mutation(
     "request-repeated",
     "a request of one name is carried out once",
     (
-        Ledger,
+        JobBook,
         "_operate",
         lambda operate: (
-            lambda self, record: (operate(self, record), self.requests.pop(record.request.request, None))[0]
+            lambda self, operation: (
+                operate(self, operation),
+                self.operations.names.pop(operation.request.request, None),
+            )[0]
         ),
     ),
     alone=False,
@@ -371,31 +369,31 @@ for action in (Cancel, Settle, Change, Pause, Resume):
     add_mutation(
         f"{action.__name__.lower()}-ignored",
         f"a request to {action.__name__.lower()} has its effect",
-        (Ledger, "_operate", _ignores(action)),
+        (JobBook, "_operate", _ignores(action)),
         alone=False,
     )
 add_mutation(
     "pause-without-effect",
     "a paused arm gets no job",
-    (LedgerView, "is_paused", lambda _: lambda self, arm: False),
+    (JobBook, "is_paused", lambda _: lambda self, arm: False),
     alone=False,
 )
 add_mutation(
     "cancelled-awarded",
     "a cancelled job goes to no other arm",
-    (Ledger, "_cancel", lambda _: lambda self, entry: []),
+    (JobBook, "_reason_to_abandon", lambda _: lambda self, entry: None),
     alone=False,
 )
 add_mutation(
     "redo-at-once",
     "nothing is redone that an arm may still do",
-    (auctioneer_module, "objection", _redone_at_once),
+    (steering_module, "objection", _redone_at_once),
     alone=False,
 )
 add_mutation(
     "clear-at-once",
     "space is freed only after the lease of its arm",
-    (auctioneer_module, "cleared_space", _cleared_at_once),
+    (auctioneer_module, "clear", _cleared_at_once),
     alone=False,
 )
 add_mutation(

@@ -20,20 +20,19 @@ from benchmarks.simulation.world import Process, World
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobSpec, Submission, SubmissionReply
 from fleet.errors import BusError
+from fleet.live import book as book_module
 from fleet.live import journal as journal_module
 from fleet.live import supervisor as supervisor_module
 from fleet.live.arm import node as arm_module
 from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardExecutor, ExecutorConfig
 from fleet.live.arm.node import ArmConfig, ArmNode, AuctioneerClient
-from fleet.live.auction import ledger as ledger_module
 from fleet.live.auction.node import AuctionNode
-from fleet.live.auction.records import AuctionRecord
-from fleet.live.auction.rounds import Allocate, Timing
-from fleet.live.consensus import jobs
-from fleet.live.consensus.jobs import GrantRecord
+from fleet.live.auction.rounds import Allocate
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
 from fleet.live.journal import CompactingJournal, Journal
+from fleet.live.leases import Timing
+from fleet.live.records import BookRecord
 from fleet.live.space import Excludes
 from fleet.live.supervisor import Part, Supervisor
 from scenarios.live.arm import fleet_clock, restart_history
@@ -84,7 +83,7 @@ class ArmProcess:
         settings = ArmConfig(warning_c=80.0, rate_hz=self._rate_hz, boot=history.boot)
         if self._membership is None:
             return ArmNode(link, body, executor, estimator, clock, settings, partial(AuctioneerClient, history=kept))
-        grants, membership = _journal(process, "grants", GrantRecord), self._membership
+        grants, membership = _journal(process, "grants", BookRecord), self._membership
         return ArmNode(
             link,
             body,
@@ -103,7 +102,7 @@ def auctioneer_process(
 
     def build(process: Process) -> AuctionNode:
         link: Any = SimulatedClient(process)
-        journal = _journal(process, "auction", AuctionRecord)
+        journal = _journal(process, "auction", BookRecord)
         return AuctionNode(
             link, AUCTIONEER, journal, allocate=allocate, speed=speed, timing=timing, arms=arms, excludes=excludes
         )
@@ -265,8 +264,7 @@ def simulated_system(world: World) -> Iterator[None]:
     )
     replace(supervisor_module, "threading", SimpleNamespace(Thread=Thread, Event=threading.Event))
     replace(journal_module, "COMPACT_BYTES", 5_000)  # so that both happen in a short shift
-    replace(ledger_module, "MAX_SETTLED", 5)
-    replace(jobs, "MAX_SETTLED", 5)
+    replace(book_module, "MAX_SETTLED", 5)
     replace(arm_module, "plan_key", lambda plan: plan.space)
     replace(arm_module, "space_name", str)
     try:

@@ -28,7 +28,7 @@ from fleet.bus.protocol.operator import (
     Settle,
 )
 from fleet.job import reason_to_give_up
-from fleet.live.auction.rounds import Timing
+from fleet.live.leases import Timing
 
 LONGEST_WRITES = 60
 """Changing disk calls until a planned crash, at most."""
@@ -145,14 +145,14 @@ class Shift(Fleet):
     def statuses(self) -> dict[str, str]:
         """State of every job, as the participants know it."""
         if not self.alone:
-            ledger, auctioneer = self.node(AUCTIONEER).auctioneer.ledger, self.node(AUCTIONEER).auctioneer
-            past = [name for name in self.submitter.accepted if name in ledger.past]
-            states = {name: "finished" if ledger.past.is_finished(name) else "given_up" for name in past}
+            book, auctioneer = self.node(AUCTIONEER).book, self.node(AUCTIONEER).auctioneer
+            past = [name for name in self.submitter.accepted if name in book.past]
+            states = {name: "finished" if book.past.is_finished(name) else "given_up" for name in past}
             return states | {each.job: each.state for each in auctioneer.status()}
         states = {}
         for name in self.arms:
             known = {each.job: each.state for each in self.node(name).work_source.statuses()}
-            past = self.node(name).work_source.participant.granter.register.past
+            past = self.node(name).work_source.book.past
             left = [job for job in self.submitter.accepted if job in past and job not in known]
             known |= {job: "finished" if past.is_finished(job) else "given_up" for job in left}
             for job, state in known.items():
@@ -187,9 +187,9 @@ class Shift(Fleet):
 
     def _is_paused(self) -> bool:
         if not self.alone:
-            return (node := self.node(AUCTIONEER)) is not None and bool(node.auctioneer.ledger.paused)
+            return (node := self.node(AUCTIONEER)) is not None and bool(node.book.operations.paused)
         nodes = (node for name in self.arms if (node := self.node(name)) is not None)
-        return any(node.work_source.participant.granter.register.operations.paused for node in nodes)
+        return any(node.work_source.book.operations.paused for node in nodes)
 
     def _settle(self) -> None:
         deadline_s = self.world.now_s + SETTLE_S + 3.0 * self.work_s
@@ -221,7 +221,7 @@ class Shift(Fleet):
                 raise Violation(f"'{name}' is given up without a reason.")
 
         if not self.alone:
-            check_steering(self.sent, states, self.node(AUCTIONEER).auctioneer.ledger.jobs)
+            check_steering(self.sent, states, self.node(AUCTIONEER).auctioneer.book.jobs)
 
     def _check_space(self) -> None:
         """Check that arms that are idle at home take no space: it would stay closed if they left now.
@@ -240,10 +240,10 @@ class Shift(Fleet):
         if any(self.node(name) is None for name in self.names):
             return ["a process"]
         if not self.alone:
-            space = self.node(AUCTIONEER).auctioneer.ledger.taken_space()
+            space = self.node(AUCTIONEER).auctioneer.book.taken_space()
             return [arm for arm in self.arms if space.get(arm)] if self.submitter.accepted else []
-        registers = [self.node(name).work_source.participant.granter.register for name in self.arms]
-        return [arm for arm in self.arms if any(register.space[arm] for register in registers)]
+        spaces = [self.node(name).work_source.book.taken_space() for name in self.arms]
+        return [arm for arm in self.arms if any(space[arm] for space in spaces)]
 
     def _end_recording(self) -> None:
         process, deadline_s = self.world.processes[RECORDER], self.world.now_s + RECORD_S
@@ -430,7 +430,7 @@ def steer(shift: Shift) -> None:
     if not shift.submitter.accepted:
         return
     node: Any = shift.node(AUCTIONEER) if AUCTIONEER in shift.names else None
-    entries = {} if node is None else node.auctioneer.ledger.jobs
+    entries = {} if node is None else node.auctioneer.book.jobs
     unfinished = [name for name, entry in entries.items() if entry.state == "unfinished"]  # a person sees them
     job = shift.rng.choice(unfinished or list(shift.submitter.accepted))
     arm = shift.rng.choice([ALL_ARMS, *shift.arms])

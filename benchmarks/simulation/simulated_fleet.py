@@ -16,8 +16,9 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobSpec
 from fleet.bus.protocol.operator import Cleared, ClearRequest
 from fleet.live.auction.knowledge import LiveFleet
-from fleet.live.auction.rounds import Allocate, Assignment, Timing
+from fleet.live.auction.rounds import Allocate, Assignment
 from fleet.live.consensus.participant import Choose, Membership
+from fleet.live.leases import Timing
 from fleet.live.space import ANYWHERE, Excludes
 from fleet.robot import ThermalLimits
 
@@ -191,9 +192,9 @@ class Fleet:
                     holders[active.job] = name
 
     def _check_known(self) -> None:
-        ledger = self.node(AUCTIONEER).auctioneer.ledger
-        if len(self.submitter.accepted) > len(ledger.jobs) + len(ledger.past):
-            lost = [name for name in self.submitter.accepted if name not in ledger.jobs and name not in ledger.past]
+        book = self.node(AUCTIONEER).book
+        if len(self.submitter.accepted) > len(book.jobs) + len(book.past):
+            lost = [name for name in self.submitter.accepted if name not in book.jobs and name not in book.past]
             raise Violation(f"The auctioneer does not know '{lost[0]}', which it accepted.")
 
     def _after_exit(self, process: Process) -> None:

@@ -20,14 +20,16 @@ def check_steering(sent: Sent, states: Mapping[str, str], jobs: Mapping[str, Any
 
     Args:
         states: State of every job at the end.
-        jobs: Entries of the ledger.
+        jobs: Entries of the job book.
 
     Raises:
         Violation: a rule is broken.
     """
     messages = [message for _, message in sorted(sent.messages.items(), key=lambda item: item[0])]
     operations = [message for message in messages if isinstance(message, Operation)]
-    awards = [each for each in messages if isinstance(each, Result) and each.status.state == "awarded"]
+    results = [each for each in messages if isinstance(each, Result) and each.status.state == "awarded"]
+    # Later results of an award tell that a person has changed or cancelled its job.
+    awards = list({each.status.award: each for each in reversed(results)}.values())
     for name, count in Counter(each.request.request for each in operations).items():
         if count > 1:
             raise Violation(f"The request '{name}' was carried out {count} times.")

@@ -386,31 +386,17 @@ class CommitPermitted(msgspec.Struct, frozen=True, tag="commit_permitted"):
 
 
 class Released(msgspec.Struct, frozen=True, tag="released"):
-    """The arm no longer has the award, and has nothing to report on it."""
+    """The arm no longer has the award, and has nothing to report on it, or has not reported it."""
 
     award: Name
     job: str = ""
     arm: str = ""
-    number: Count = 0
-    """Number of the claim that released it, where arms allocate by consensus."""
-
-
-class Closed(msgspec.Struct, frozen=True, tag="closed"):
-    """An award has ended."""
-
-    award: Name
-    outcome: Literal["finished", "returned", "refused", "dropped"]
+    outcome: Literal["released", "refused", "dropped"] = "released"
     """refused: the arm did not accept it; dropped: its lease has expired."""
-    cycles: Count
+    cycles: Count = 0
     """Done so far, by any arm."""
-    time_s: float
+    time_s: float = 0.0
     reason: str = ""
-    unsure: bool = False
-    """As in `fleet.bus.protocol.auction.Report`."""
-    job: str = ""
-    arm: str = ""
-    faulted: bool = False
-    """As in `fleet.bus.protocol.auction.Report`."""
 
 
 class SpaceTaken(msgspec.Struct, frozen=True, tag="space_taken"):
@@ -420,8 +406,6 @@ class SpaceTaken(msgspec.Struct, frozen=True, tag="space_taken"):
     space: tuple[Name, ...] = ()
     """Names, without those of its open awards."""
     time_s: float = 0.0
-    number: Count = 0
-    """Of the claim that reports it, where arms allocate by consensus."""
 
 
 class SpaceCleared(msgspec.Struct, frozen=True, tag="space_cleared"):
@@ -465,7 +449,7 @@ def own_records(journal: Journal[Record], name: str) -> Iterator[Record]:
     """Yield the records of the journal of an arm or auctioneer, oldest first.
 
     Raises:
-        JournalError: it is of another one, or damaged. Journals of earlier versions may name none.
+        JournalError: it is of another one, or damaged.
     """
     for record in journal.records():
         if isinstance(record, Started) and record.name not in ("", name):

@@ -27,10 +27,10 @@ from fleet.live.arm.body import Body, ReplayBody, SensorLog
 from fleet.live.arm.estimator import Estimator, NominalPeaks
 from fleet.live.arm.node import ArmConfig, ArmNode, AuctioneerClient, WorkSource
 from fleet.live.clock import FleetClock
-from fleet.live.consensus.jobs import GrantRecord
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
 from fleet.live.journal import CompactingJournal, Journal, own_records, quarantine
+from fleet.live.records import BookRecord, salvage
 from fleet.live.supervisor import return_memory
 from fleet.motion import Plan
 from scenarios.live.auctioneer import folder_of, live_fleet, refuse_other_way, scenario_jobs, summary
@@ -110,7 +110,8 @@ def run_arm(
         if alone:
             refuse_auctioneer(link)
             membership = membership_of(scenario, name, spec.policy, jobs=spec.jobs, seed=spec.seed)
-            grants = resources.enter_context(Journal[GrantRecord](folder / f"{name}.grants", GrantRecord))
+            grants = Journal[BookRecord](folder / f"{name}.grants", BookRecord, quarantine=salvage(aside))
+            resources.enter_context(grants)
             source = partial(ConsensusNode, membership=membership, journal=grants, new_epoch=spec.new_epoch)
 
         node = make_node(link, book, arm, scenario, speed=speed, rate_hz=rate_hz, capacity=capacity, work_source=source)
@@ -360,7 +361,7 @@ def serve_until_done(node: ArmNode, stop: StopRequest) -> bool:
         node.serve(time.monotonic() + TURN_S)
     if stop.is_set():
         return False
-    left = source.participant.granter.register.settled.left
+    left = source.participant.book.left
     echo(summary(source.statuses(), node.clock.now_s(time.monotonic()), left))
     echo(f"This is the view of one arm, after {source.participant.rounds} rounds of allocation.")
     until_s = time.monotonic() + FAREWELL_S

@@ -18,9 +18,10 @@ from fleet.errors import BusError, FleetError, Refused
 from fleet.job import Job
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.node import AuctionNode
-from fleet.live.auction.records import AuctionRecord, salvage
-from fleet.live.auction.rounds import Allocate, Assignment, Bidding, Timing, resolve_claims
+from fleet.live.auction.rounds import Allocate, Assignment, Bidding, resolve_claims
 from fleet.live.journal import Journal, quarantine
+from fleet.live.leases import Timing
+from fleet.live.records import BookRecord, salvage
 from fleet.live.supervisor import return_memory
 from scenarios.live.cell import cell_of
 from scenarios.policy_loader import ON_BUS, OnBus, policy_at, scope_of, without_simulator
@@ -125,7 +126,7 @@ def run_auctioneer(scenario: Scenario, name: str, spec: LiveSpec, endpoint: str)
     with (
         until_stopped() as stop,
         BusClient(endpoint, fleet, stopped=stop.is_set) as link,
-        Journal[AuctionRecord](folder / f"{name}.journal", AuctionRecord, quarantine=aside) as book,
+        Journal[BookRecord](folder / f"{name}.journal", BookRecord, quarantine=aside) as book,
     ):
         places = frozenset(place.name for place in scenario.places)
         timing = Timing(max_jobs=scenario.slots)
@@ -146,18 +147,17 @@ def run_auctioneer(scenario: Scenario, name: str, spec: LiveSpec, endpoint: str)
             _LOG.error("Refused: %s", sentence)
         return_memory()
         echo(f"ready {name} {endpoint} {os.getpid()}")
-        ledger = node.auctioneer.ledger
-        if ledger.jobs:
-            so_far = summary(node.auctioneer.status(), node.time_s, ledger.left).partition("\n")[0]
+        if node.book.jobs:
+            so_far = summary(node.auctioneer.status(), node.time_s, node.book.left).partition("\n")[0]
             _LOG.warning("Continuing from %s: %s", book.path, so_far)
-        if node.auctioneer.ledger.ended:
+        if node.book.ended:
             _LOG.warning("That shift is over; another --journal (of thermofleet up: --out) begins a new one.")
         if own:
             submit_stream(node, own, scenario.horizon_s, stop)
         else:
             while not stop.is_set():
                 node.serve(time.monotonic() + TURN_S)
-        echo(summary(node.auctioneer.status(), node.time_s, ledger.left))
+        echo(summary(node.auctioneer.status(), node.time_s, node.book.left))
         stop.leave(f"Interrupted at {node.time_s:.0f} s; the journal is {book.path}, and the same command continues.")
 
 
@@ -165,7 +165,7 @@ def submit_stream(
     node: AuctionNode, stream: Sequence[tuple[float, JobSpec]], horizon_s: float, stop: StopRequest
 ) -> None:
     """Serve, and submit a stream of jobs as they are released, until all are settled or the shift is over."""
-    left = [] if node.auctioneer.ledger.ended else list(stream)
+    left = [] if node.book.ended else list(stream)
     while not stop.is_set():
         node.serve(time.monotonic() + TURN_S)
         due = tuple(job for at_s, job in left if at_s <= node.time_s)
@@ -177,10 +177,10 @@ def submit_stream(
                 del left[: len(due)]
             except Refused as error:
                 _LOG.error("Could not submit the scenario's jobs; retrying: %s", error)
-        over = node.time_s >= horizon_s and not node.auctioneer.ledger.ended
+        over = node.time_s >= horizon_s and not node.book.ended
         if over:
             node.end()
-        if over or not (left or node.auctioneer.ledger.unsettled()):
+        if over or not (left or node.book.unsettled()):
             break
     first_s, last_s = (time.monotonic() + farewell_s for farewell_s in FAREWELL_S)
     while not stop.is_set() and time.monotonic() < (last_s if node.auctioneer.finishing() else first_s):

@@ -487,8 +487,8 @@ def test_asyncapi_has_every_key_and_no_loose_end():
 @pytest.mark.parametrize(
     ("nodes", "role"),
     [
-        (("arm/node", "consensus/node"), "arm"),
-        (("auction/node",), "auction"),
+        (("arm/node", "consensus/node", "desk"), "arm"),
+        (("auction/node", "desk"), "auction"),
     ],
 )
 def test_the_participants_publish_and_answer_as_the_contract_says(nodes, role):

@@ -20,7 +20,7 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.operator import Action, Cleared, ClearRequest, Controlled, ControlRequest
 from fleet.errors import Refused
-from fleet.live.auction.rounds import Timing
+from fleet.live.leases import Timing
 from fleet.live.space import Excludes, no_conflicts
 
 TIMING = Timing(lease_s=3.0, margin_s=0.05, window_s=0.3, ack_s=0.5, pause_s=(0.2, 1.0), max_jobs=8)

@@ -27,7 +27,8 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.operator import ALL_ARMS, Pause, Resume, Settle
 from fleet.job import reason_to_give_up
-from fleet.live.auction.rounds import Assignment, Timing
+from fleet.live.auction.rounds import Assignment
+from fleet.live.leases import Timing
 from fleet.live.space import ANYWHERE
 from tests.live.simulated import LONG, SPEED, TIMING, SimulatedFleet, job, refused
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from benchmarks.chaos.fleet_under_test import JournalFiles
-from fleet.bus.protocol.auction import Award, JobSpec
-from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted
-from fleet.live.journal import Closed, Journal
+from fleet.bus.protocol.auction import Award, JobSpec, Report
+from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, Closed
+from fleet.live.journal import Journal
 
 ROOT = Path(__file__).parents[2]
 
@@ -33,7 +33,7 @@ def test_jobs_are_counted_that_a_journal_has_left_out(tmp_path):
     def close(journal, award, job):
         journal.append(
             AwardAccepted(Award(award, "r", "auctioneer", "q", JobSpec(job, "hold", ("x",)))),
-            Closed(award, "finished", 1, 0.0, job=job, arm="a"),
+            Closed(Report("a", award, job, "finished", 1, 0.0)),
         )
 
     files = JournalFiles(tmp_path)

@@ -8,11 +8,13 @@ from hypothesis import strategies as st
 from fleet.bus.protocol.auction import JobSpec
 from fleet.bus.protocol.consensus import Claim, ClaimEntry, JobOutcome
 from fleet.job import reason_to_give_up
-from fleet.live.auction.ledger import MAX_SETTLED, Ledger
-from fleet.live.auction.records import AuctionRecord, Awarded
+from fleet.live.book import MAX_SETTLED, JobBook
 from fleet.live.consensus.grants import Granter
-from fleet.live.consensus.jobs import GrantRecord, Register
-from fleet.live.journal import Closed, JobsAccepted
+from fleet.live.doubts import replay
+from fleet.live.journal import JobsAccepted
+from fleet.live.leases import expire
+from fleet.live.records import BookRecord, Granted
+from tests.live.records import awarded, closed
 
 JOB = JobSpec(name="j", kind="hold", places=("x",), repetitions=9)
 NEXT = JobSpec(name="k", kind="hold", places=("x",), after=("j",))
@@ -33,29 +35,33 @@ def test_two_faults_of_one_arm_or_three_of_all_are_too_many(arms):
     assert all(f"'{arm}' {arms.count(arm)} time" in reason for arm in arms) or not reason
 
 
-def awarded(number: int, arm: str) -> Awarded:
-    return Awarded(f"w{number}", "r", "j", arm, "q", 0, float(number))
+def award(number: int, arm: str) -> Granted:
+    return awarded(f"w{number}", "j", arm, place="x", time_s=float(number))
+
+
+def end(number: int, arm: str, outcome: str, time_s: float, cycles: int = 0, *, faulted: bool = False) -> BookRecord:
+    return closed(f"w{number}", outcome, cycles, time_s, "hot", job="j", arm=arm, faulted=faulted)
 
 
 @given(attempts)
 def test_the_auctioneer_gives_a_job_up_at_that_fault_and_no_other_event(attempts):
     """Against a list of faults; a replay of the journal, and of its snapshot, gives the same."""
-    written: list[AuctionRecord] = [JobsAccepted((JOB, NEXT), "test", 0.0)]
-    book, faults = Ledger().replay(written), list[str]()
+    written: list[BookRecord] = [JobsAccepted((JOB, NEXT), "test", 0.0)]
+    book, faults = replay(JobBook(), written), list[str]()
     for number, (arm, end) in enumerate(attempts, start=1):
         if too_often(faults):
             break
         assert [job.name for job in book.ready(99.0, 9)] == ["j"]
         outcome = "returned" if end == "faulted" else end
         records = [
-            awarded(number, arm),
-            Closed(f"w{number}", outcome, 1, float(number), "hot", faulted=end == "faulted"),
+            award(number, arm),
+            closed(f"w{number}", outcome, 1, float(number), "hot", job="j", arm=arm, faulted=end == "faulted"),
         ]
         written += records
         for record in records:
             book.apply(record)
         faults += [arm] if end == "faulted" else []
-    for ledger in (book, Ledger().replay(written), Ledger().replay(book.compact())):
+    for ledger in (book, replay(JobBook(), written), replay(JobBook(), book.compact())):
         (status,) = ledger.status(["j"])
         assert status.state == ("given_up" if too_often(faults) else "waiting")
         if too_often(faults):
@@ -67,32 +73,32 @@ def test_the_auctioneer_gives_a_job_up_at_that_fault_and_no_other_event(attempts
 
 
 def test_faults_of_lost_arms_count_when_they_are_reported_late():
-    book = Ledger().replay([JobsAccepted((JOB,), "test", 0.0)])
+    book = replay(JobBook(), [JobsAccepted((JOB,), "test", 0.0)])
     for number in (1, 2):
-        book.apply(awarded(number, "a"))
-        book.apply(Closed(f"w{number}", "dropped", 0, float(number)))
-    book.apply(Closed("w1", "returned", 0, 3.0, faulted=True))
+        book.apply(award(number, "a"))
+        book.apply(end(number, "a", "dropped", float(number)))
+    book.apply(end(1, "a", "returned", 3.0, faulted=True))
     assert book.status()[0].state == "waiting"
-    (change,) = book.apply(Closed("w2", "returned", 0, 4.0, faulted=True))
+    (change,) = book.apply(end(2, "a", "returned", 4.0, faulted=True))
     assert change.status.state == "given_up"
-    (change,) = book.apply(Closed("w2", "finished", 9, 5.0))
+    (change,) = book.apply(end(2, "a", "finished", 5.0, 9))
     assert change.status.state == "finished", "it was done after all"
 
 
 def test_jobs_that_wait_for_a_job_that_is_given_up_are_given_up_until_that_one_is_finished():
     last = JobSpec(name="a", kind="hold", places=("x",), after=("k",))  # sorted before the others
-    book = Ledger().replay([JobsAccepted((JOB, NEXT), "test", 0.0)])
+    book = replay(JobBook(), [JobsAccepted((JOB, NEXT), "test", 0.0)])
     for number in (1, 2):
-        book.apply(awarded(number, "a"))
-        changes = book.apply(Closed(f"w{number}", "returned", 0, float(number), faulted=True))
+        book.apply(award(number, "a"))
+        changes = book.apply(end(number, "a", "returned", float(number), faulted=True))
     assert [(change.status.job, change.status.state) for change in changes] == [("j", "given_up"), ("k", "given_up")]
     (admission,) = book.admit((last,))
     assert (admission.accepted, admission.reason) == (True, LOST.replace("'j'", "'k'"))
     (change,) = book.apply(JobsAccepted((last,), "test", 3.0))
     assert (change.status.state, change.status.reason) == ("given_up", admission.reason)
-    for ledger in (book, Ledger().replay(book.compact())):
+    for ledger in (book, replay(JobBook(), book.compact())):
         assert not ledger.unsettled()
-        changes = ledger.apply(Closed("w2", "finished", 9, 5.0))
+        changes = ledger.apply(end(2, "a", "finished", 5.0, 9))
         assert {change.status.job: change.status.state for change in changes} == {
             "j": "finished",
             "k": "waiting",
@@ -102,24 +108,24 @@ def test_jobs_that_wait_for_a_job_that_is_given_up_are_given_up_until_that_one_i
 
 
 def test_a_late_fault_does_not_take_the_job_from_another_arm():
-    book = Ledger().replay([JobsAccepted((JOB,), "test", 0.0)])
+    book = replay(JobBook(), [JobsAccepted((JOB,), "test", 0.0)])
     for number, arm in enumerate("ab", start=1):
-        book.apply(awarded(number, arm))
-        book.apply(Closed(f"w{number}", "dropped", 0, 1.0))
-    book.apply(awarded(3, "c"))
-    for number in (1, 2):
-        assert not book.apply(Closed(f"w{number}", "returned", 0, 3.0, faulted=True))
+        book.apply(award(number, arm))
+        book.apply(end(number, arm, "dropped", 1.0))
+    book.apply(award(3, "c"))
+    for number, arm in enumerate("ab", start=1):
+        assert not book.apply(end(number, arm, "returned", 3.0, faulted=True))
     assert book.status()[0].state == "awarded"
-    book.apply(Closed("w3", "returned", 0, 4.0, faulted=True))
+    book.apply(end(3, "c", "returned", 4.0, faulted=True))
     assert book.status()[0].state == "given_up"
 
 
 # without an auctioneer
 
 
-def granter_of(disk: list[GrantRecord]) -> Granter:
-    register = Register().replay(disk)
-    return Granter("d", ROSTER, register, lambda *records: disk.extend(records), real_s=0.0)
+def granter_of(disk: list[BookRecord]) -> Granter:
+    book = replay(JobBook(is_central=False), disk)
+    return Granter("d", ROSTER, book, lambda *records: disk.extend(records), real_s=0.0)
 
 
 def attempt(granter: Granter, arm: str, number: int, faults: dict[str, str]) -> str:
@@ -129,21 +135,26 @@ def attempt(granter: Granter, arm: str, number: int, faults: dict[str, str]) -> 
     assert [each.award for each in asked.granted] == [award]
     returned = JobOutcome("j", award, arm, "returned", 0, 1.0, "hot", faults | {award: arm})
     granter.answer_claim(Claim(arm, 2 * number + 1, (), (returned,)), 0.0)
-    return granter.status("j", 0.0).state
+    return state(granter, 0.0)
+
+
+def state(granter: Granter, real_s: float) -> str:
+    expire(granter.book, real_s, 0.0)
+    return granter.book.status_of(granter.book.jobs["j"]).state
 
 
 @given(st.lists(st.sampled_from("abc"), min_size=1))
 def test_an_arm_grants_a_job_until_arms_have_faulted_in_it_too_often(arms):
-    disk: list[GrantRecord] = []
+    disk: list[BookRecord] = []
     granter, done = granter_of(disk), list[str]()
     for number, arm in enumerate(arms):
         done.append(arm)
-        state = attempt(granter, arm, number, {})
-        assert state == ("given_up" if too_often(done) else "waiting")
-        if state == "given_up":
+        now = attempt(granter, arm, number, {})
+        assert now == ("given_up" if too_often(done) else "waiting")
+        if now == "given_up":
             break
-    for each in (granter, granter_of(disk), granter_of(list(granter.register.compact()))):
-        assert each.status("j", 99.0).state == ("given_up" if too_often(done) else "waiting")
+    for each in (granter, granter_of(disk), granter_of(list(granter.book.compact()))):
+        assert state(each, 99.0) == ("given_up" if too_often(done) else "waiting")
         reply = each.answer_claim(Claim("a", 999, (ClaimEntry("a-999", "j", ("x",), 0, "requested"),)), 99.0)
         if too_often(done):
             assert not reply.granted
@@ -166,13 +177,13 @@ def test_a_job_that_an_arm_has_is_not_given_up_and_finishing_it_counts_more():
     granter.answer_claim(Claim("b", 1, (have,)), 0.0)
     granter.add_faults("j", {"a-9": "a"})  # heard late
     assert granter.answer_claim(Claim("b", 2, (have,)), 0.1).granted
-    assert granter.status("j", 0.1).state == "awarded"
+    assert state(granter, 0.1) == "awarded"
     granter.answer_claim(Claim("b", 3, ()), 0.2)  # b releases it
-    assert granter.status("j", 0.2).state == "given_up"
+    assert state(granter, 0.2) == "given_up"
     granter.apply_outcome(JobOutcome("j", "b-1", "b", "finished", 9, 3.0))
-    assert granter.status("j", 0.3).state == "finished"
+    assert state(granter, 0.3) == "finished"
     granter.apply_outcome(JobOutcome("j", "b-1", "b", "given_up", 9, 3.0))
-    assert granter.status("j", 0.3).state == "finished"
+    assert state(granter, 0.3) == "finished"
 
 
 def test_the_work_for_jobs_that_expire_together_grows_with_their_number():
@@ -180,7 +191,7 @@ def test_the_work_for_jobs_that_expire_together_grows_with_their_number():
 
     def calls(count: int) -> int:
         jobs = tuple(JobSpec(f"j{number}", "hold", ("x",), due_s=1.0, expires=True) for number in range(count))
-        book, calls = Ledger().replay([JobsAccepted(jobs, "test", 0.0)]), 0
+        book, calls = replay(JobBook(), [JobsAccepted(jobs, "test", 0.0)]), 0
 
         def count_call(*_: object) -> None:
             nonlocal calls
@@ -188,7 +199,7 @@ def test_the_work_for_jobs_that_expire_together_grows_with_their_number():
 
         sys.setprofile(count_call)
         try:
-            book.replay(book.expired(2.0))
+            replay(book, book.expired(2.0))
         finally:
             sys.setprofile(None)
         assert (len(book.jobs), book.unsettled()) == (MAX_SETTLED, [])

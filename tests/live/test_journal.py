@@ -11,18 +11,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.bus.protocol.auction import Award, JobSpec
+from fleet.bus.protocol.auction import Award, JobSpec, Report
 from fleet.bus.protocol.messages import encode
 from fleet.errors import FleetError, JournalError, JournalFull
 from fleet.live import journal
-from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, JobsFinished, ReportReceived
+from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, Closed, JobsFinished, ReportReceived
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.node import AuctionNode
-from fleet.live.auction.records import AuctionRecord
-from fleet.live.consensus.jobs import GrantRecord, Register
+from fleet.live.book import JobBook
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
-from fleet.live.journal import Closed, CommitPermitted, CompactingJournal, Journal, Started, TimeRecorder
+from fleet.live.doubts import replay
+from fleet.live.journal import CommitPermitted, CompactingJournal, Journal, Started, TimeRecorder
+from fleet.live.records import BookRecord
 from scenarios.live.arm import restart_history
 from tests.live.council.test_council_poison import Arm
 from tests.live.test_poison import Wire
@@ -313,14 +314,14 @@ def test_after_a_failed_sync_of_the_folder_further_writes_are_refused(tmp_path):
 def test_fleet_time_never_runs_backwards_after_a_restart(tmp_path, monkeypatch):
     """Not even if the journal was compacted after the last job event."""
     monkeypatch.setattr(journal, "COMPACT_BYTES", 1)
-    with Journal[GrantRecord](tmp_path / "j", GrantRecord) as book:
-        recorder = TimeRecorder(book, Register(), real_s=0.0)
+    with Journal[BookRecord](tmp_path / "j", BookRecord) as book:
+        recorder = TimeRecorder(book, JobBook(), real_s=0.0)
         assert recorder.start_s(speed=60.0) == 0.0
         for real_s in range(1, 30):
             recorder.step(float(real_s), 60.0 * real_s)
         assert len(list(book.records())) < 10
-    with Journal[GrantRecord](tmp_path / "j", GrantRecord) as book:
-        again = TimeRecorder(book, Register().replay(book.records()), real_s=0.0)
+    with Journal[BookRecord](tmp_path / "j", BookRecord) as book:
+        again = TimeRecorder(book, replay(JobBook(), book.records()), real_s=0.0)
         assert 29 * 60.0 <= again.start_s(speed=60.0) <= 31 * 60.0
 
 
@@ -335,7 +336,7 @@ def test_the_journal_of_an_arm_stays_short_while_it_is_written(tmp_path, monkeyp
             award = Award(f"award {number}", "round", "auctioneer", "quote", job, epoch=f"{number // 1500}")
             records = [AwardAccepted(award), CommitPermitted(award.award)]
             if number < 1999:
-                records += [Closed(award.award, "finished", 1, 1.0, job=job.name, arm="a"), ReportReceived(award.award)]
+                records += [Closed(Report("a", award.award, job.name, "finished", 1, 1.0)), ReportReceived(award.award)]
             kept.append(*records)
             whole.replay(records)
             sizes.append(path.stat().st_size)
@@ -358,7 +359,7 @@ def test_a_history_of_long_names_fits_into_one_message():
     assert len(encode(message)) < 65_536
 
 
-KINDS = {"arm": ArmRecord, "arm without auctioneer": GrantRecord, "auctioneer": AuctionRecord}
+KINDS = {"arm": ArmRecord, "arm without auctioneer": BookRecord, "auctioneer": BookRecord}
 
 
 def start(kind: str, name: str, journal) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from fleet.arm.space import plan_key, space_name
 from fleet.bus.protocol.auction import Award, QuoteRequest, Submission
-from fleet.bus.protocol.consensus import Bid, JobOutcome
+from fleet.bus.protocol.consensus import Bid
 from fleet.bus.protocol.messages import State
 from fleet.difficulty import KNOWN, Difficulty, Forecast
 from fleet.env.allocation_v2 import Episode, parallel_env
@@ -25,11 +25,12 @@ from fleet.live.arm.estimator import Estimator, NominalPeaks
 from fleet.live.arm.node import ArmConfig, ArmNode, PlanningThread
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.knowledge import LiveFleet
-from fleet.live.auction.ledger import Ledger
-from fleet.live.auction.rounds import SendAward, Timing
+from fleet.live.book import JobBook
 from fleet.live.consensus.grants import Granter
-from fleet.live.consensus.jobs import Grant, Register
 from fleet.live.consensus.participant import QUIET_S, Membership, Participant
+from fleet.live.doubts import replay
+from fleet.live.leases import Timing
+from fleet.live.records import SendAward
 from fleet.live.space import CellSpace
 from fleet.observation import FIELDS, Observation
 from fleet.robot import JOINTS, ThermalLimits
@@ -112,7 +113,7 @@ class LiveShift:
         self.excludes = CellSpace(volume=volume, conflicts=table, reach=reach, arms=frozenset(NAMES))
         timing = Timing(lease_s=HOUR_S, pause_s=(0.1, 0.2))
         rules = {"allocate": allocate, "timing": timing, "excludes": self.excludes}
-        ledger = Ledger(arms=NAMES)
+        ledger = JobBook(arms=NAMES)
         self.auctioneer = Auctioneer("x", ledger, keep=lambda *_: None, boot="1", real_s=0.0, **rules)
         self.auctioneer.submit(Submission(self.jobs), 0.0, 0.0)
         self.wires = {name: Wire() for name in NAMES}
@@ -176,7 +177,7 @@ class LiveShift:
 
 def observed_without_auctioneer(shift: LiveShift) -> dict[str, Observation]:
     """Return what the policy of each free arm would observe now if the arms allocated the jobs themselves."""
-    ledger, observed = shift.auctioneer.ledger, dict[str, Observation]()
+    observed = dict[str, Observation]()
 
     def wait(observation: Observation, place: int) -> int:
         observed[NAMES[place]] = observation
@@ -184,11 +185,11 @@ def observed_without_auctioneer(shift: LiveShift) -> dict[str, Observation]:
 
     participants = {}
     for name, node in shift.nodes.items():
-        granter = Granter(name, NAMES, Register(), lambda *_: None, real_s=0.0, excludes=shift.excludes)
-        fill(granter.register, ledger, shift.auctioneer.rounds.states)
+        book = copy_of(shift.auctioneer.book, shift.auctioneer.rounds.states)
+        granter = Granter(name, NAMES, book, lambda *_: None, real_s=0.0, excludes=shift.excludes)
         membership = Membership(fleet=shift.fleet, choose=wait, slots=24, excludes=shift.excludes)
         participants[name] = Participant(node, granter, membership, boot=1, rng=Random(0))
-        participants[name].add_jobs(shift.jobs)
+        granter.add_jobs(shift.jobs)
         participants[name].states.update(shift.auctioneer.rounds.states)
         participants[name].set_present(frozenset(NAMES))
     for real_s in (0.0, 0.1):
@@ -201,21 +202,13 @@ def observed_without_auctioneer(shift: LiveShift) -> dict[str, Observation]:
     return observed
 
 
-def fill(register: Register, ledger: Ledger, states: dict[str, State]) -> None:
-    """Put what an auctioneer knows into the register of an arm."""
+def copy_of(book: JobBook, states: dict[str, State]) -> JobBook:
+    """Return the book of an arm that knows what an auctioneer knows."""
+    copy = replay(JobBook(is_central=False), book.compact())
     for name in NAMES:
-        awards = {award.record.space for award in ledger.open.values() if award.record.arm == name}
-        register.space[name] = frozenset(awards | {states[name].space} - {""})
-    for name, entry in ledger.jobs.items():
-        register.cycles[name] = entry.cycles
-        if entry.returns:
-            register.returned_s[name] = entry.returned_s
-            register.faults[name] = {str(number): arm for number, arm in enumerate(entry.faults)}
-        if entry.state in ("finished", "given_up"):
-            register.settled.put(JobOutcome(name, "a", NAMES[0], entry.state, entry.cycles, 0.0), register.jobs)
-        elif entry.state in ("awarded", "finishing"):
-            arm = ledger.open[entry.award].record.arm
-            register.grants[name] = Grant(arm, entry.award, entry.spec.places, until_s=np.inf)
+        awards = {grant.record.space for grant in book.open.values() if grant.record.arm == name}
+        copy.space[name] = frozenset(awards | {states[name].space} - {""})
+    return copy
 
 
 class Leases:

@@ -9,7 +9,7 @@ from fleet.bus.protocol.auction import MOST_JOBS, JobSpec, Submission
 from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, decode, encode
 from fleet.bus.protocol.operator import Cancel, ClearRequest, ControlRequest
 from fleet.live.auction.auctioneer import Auctioneer
-from fleet.live.auction.ledger import Ledger
+from fleet.live.book import JobBook
 
 SOON_S = 2.0
 """Of the processor: far below the 6 s after which an arm loses its lease, and far above what a slow one takes."""
@@ -21,7 +21,7 @@ def job(name: str, *after: str) -> JobSpec:
 
 @pytest.fixture
 def auctioneer() -> Auctioneer:
-    ledger = Ledger(frozenset({"clamp"}), ("arm_0",))
+    ledger = JobBook(frozenset({"clamp"}), ("arm_0",))
     return Auctioneer(
         "auctioneer", ledger, allocate=lambda *_: {}, keep=lambda *_: None, boot="b", real_s=0.0
     )  # fmt: skip
@@ -50,7 +50,7 @@ def test_many_jobs_that_expire_at_once_give_up_those_that_wait_for_them_soon(auc
     auctioneer.tick(0.0, 10.0)
     assert time.process_time() - began_s < SOON_S
     assert {status.state for status in auctioneer.status()} == {"given_up"}
-    assert len(auctioneer.status()) + auctioneer.ledger.left["given_up"] == 8040
+    assert len(auctioneer.status()) + auctioneer.book.left["given_up"] == 8040
 
 
 def ring() -> tuple[JobSpec, ...]:

@@ -44,11 +44,11 @@ from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, AwardExe
 from fleet.live.arm.body import SimulatedBody
 from fleet.live.arm.estimator import MAX_BYTES, Estimator, NominalPeaks, _size
 from fleet.live.arm.node import ArmConfig, ArmNode, PlanningThread
-from fleet.live.auction.ledger import AuctionRecord
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.rounds import Assignment
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal, quarantine
+from fleet.live.records import BookRecord
 from fleet.motion import Plan
 from fleet.robot import ThermalLimits
 from tests.profiles import examples
@@ -141,7 +141,7 @@ def participants(tmp_path_factory, small):
         executor = AwardExecutor("arm_0", book.append, history, nonce="n")
         clock = FleetClock(1.0, time.monotonic())
         arm = ArmNode(Wire(), body, executor, estimator, clock, ArmConfig(warning_c=60.0))
-        ledger = stack.enter_context(Journal(folder / "auctioneer", AuctionRecord, sync=lambda file: None))
+        ledger = stack.enter_context(Journal(folder / "auctioneer", BookRecord, sync=lambda file: None))
         auction = AuctionNode(
             Wire(),
             "x",

@@ -7,9 +7,9 @@ import pytest
 from fleet.bus.protocol.auction import NOT_PLANNED, JobEstimate, JobSpec, PlanQuote, Quote, QuoteRequest
 from fleet.bus.protocol.messages import State
 from fleet.live.auction.auctioneer import Auctioneer
-from fleet.live.auction.job_rules import why_not_ready
-from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.rounds import Bidding, reason_to_wait
+from fleet.live.book import JobBook
+from fleet.live.job_rules import why_not_ready
 
 JOB = JobSpec(name="j", kind="hold", places=("bench",))
 NEAR = PlanQuote(plan=0, space="near", duration_s=10.0)
@@ -79,7 +79,7 @@ def test_a_job_that_cannot_be_begun_yet_says_why() -> None:
 
 
 def test_idle_arms_are_asked_for_their_space_before_there_was_any_job() -> None:
-    ledger = Ledger(arms=("a", "b"))
+    ledger = JobBook(arms=("a", "b"))
     auctioneer = Auctioneer("x", ledger, allocate=lambda _: {}, keep=lambda *_: None, boot="1", real_s=0.0)
     auctioneer.set_present(frozenset(["a", "b"]))
     auctioneer.tick(1.0, 1.0)
@@ -92,7 +92,7 @@ def test_idle_arms_are_asked_for_their_space_before_there_was_any_job() -> None:
 
 
 def test_an_arm_that_names_another_space_each_time_does_not_flood_the_fleet() -> None:
-    ledger = Ledger(arms=("a",))
+    ledger = JobBook(arms=("a",))
     auctioneer = Auctioneer("x", ledger, allocate=lambda _: {}, keep=lambda *_: None, boot="1", real_s=0.0)
     auctioneer.set_present(frozenset(["a"]))
     asked = 0

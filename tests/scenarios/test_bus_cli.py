@@ -232,7 +232,7 @@ def reports(folder):
     for path in folder.glob("*.journal"):
         if path.stem != "auctioneer":
             with Journal(path, ArmRecord) as book:
-                yield from (each for each in book.records() if isinstance(each, Closed))
+                yield from (each.report for each in book.records() if isinstance(each, Closed))
 
 
 @pytest.mark.slow

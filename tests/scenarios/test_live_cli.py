@@ -323,8 +323,8 @@ class Stage:
 
     def __init__(self, *, over: bool = False, alone_s: float = 0.0) -> None:
         self.time_s, self.alone_s, self.submitted, self.open = 0.0, alone_s, [], []
-        ledger = SimpleNamespace(unsettled=lambda: self.open, ended=over)
-        self.auctioneer = SimpleNamespace(ledger=ledger, finishing=lambda: False)
+        self.book = SimpleNamespace(unsettled=lambda: self.open, ended=over)
+        self.auctioneer = SimpleNamespace(finishing=lambda: False)
 
     @property
     def rivals(self) -> set[str]:
@@ -340,7 +340,7 @@ class Stage:
         return SubmissionReply("auctioneer", tuple(Admission(job.name, True) for job in submission.jobs))
 
     def end(self) -> None:
-        self.auctioneer.ledger.ended = True
+        self.book.ended = True
 
 
 NAMES = {"a": 0.0, "b": 3700.0, "c": 7000.0, "d": 10000.0}
@@ -361,7 +361,7 @@ def test_a_stream_is_submitted_as_released(monkeypatch, stage, horizon_s, submit
     monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
     stream = [(at_s, JobSpec(name, "hold", ("x",))) for name, at_s in NAMES.items()]
     live_auction.submit_stream(stage, stream, horizon_s, SimpleNamespace(is_set=lambda: False))
-    assert (stage.submitted, stage.auctioneer.ledger.ended) == (submitted, ended)
+    assert (stage.submitted, stage.book.ended) == (submitted, ended)
 
 
 def test_a_job_message_has_all_fields():

@@ -15,12 +15,15 @@ time, and frees it only by a later claim of that peer, never because a lease has
 An auctioneer or an arm that has lost its journal recovers from the `History` of the arms.
 """
 
+from collections.abc import Sequence
+from itertools import accumulate
 from typing import Annotated, Literal
 
 import msgspec
+from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import MOST_JOBS, Award, JobEstimate, JobSpec, LeaseTime
-from fleet.bus.protocol.messages import Count, FiniteStruct, Name, Number
+from fleet.bus.protocol.messages import LISTED_BYTES, Count, FiniteStruct, Name, Number, encode
 from fleet.bus.protocol.operator import Operation
 
 
@@ -162,3 +165,10 @@ class History(msgspec.Struct, frozen=True):
     """Number of the last claim of each arm, where arms allocate jobs without an auctioneer."""
     committed: Annotated[tuple[JobOutcome, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
     """Likewise: jobs of arms with permission to commit; unfinished if an arm has lost its journal."""
+
+
+def with_finished(history: History, jobs: Sequence[JobSpec]) -> History:
+    """Return a history with finished jobs, oldest first: as many of the last ones as fit into one message."""
+    sizes = accumulate((len(encode(job)) + 1 for job in reversed(jobs[-MOST_FINISHED:])), initial=len(encode(history)))
+    count = sum(size <= LISTED_BYTES for size in sizes) - 1
+    return replace(history, finished=tuple(jobs[len(jobs) - max(0, count) :]))

@@ -19,6 +19,8 @@ CHANGED = {"ActRequest": 5}
 """Version of each message that has changed since, by name."""
 MOST_BYTES = 65_536
 """Largest message with its attachment, in bytes; a request to a policy may be larger."""
+LISTED_BYTES = 60_000
+"""Size to which a list in a message is cut, below `MOST_BYTES`."""
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=512)]
 Person = Annotated[str, msgspec.Meta(max_length=128)]
 """Who requests something."""

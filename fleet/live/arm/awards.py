@@ -37,22 +37,27 @@ from fleet.bus.protocol.auction import (
     Receipt,
     Report,
 )
-from fleet.bus.protocol.consensus import MOST_FINISHED, History
-from fleet.bus.protocol.messages import encode
+from fleet.bus.protocol.consensus import MOST_FINISHED, History, with_finished
 from fleet.errors import JournalFull
 from fleet.live.clock import CLOCK_DRIFT
-from fleet.live.journal import Closed, CommitPermitted, JournalState, Progress, Released, Started
+from fleet.live.journal import CommitPermitted, JournalState, Progress, Released, Started
 
-MAX_BYTES = 60_000
-"""Size of a history: a router may drop larger messages."""
 MAX_PAST_AWARDS = 256
 """Closed awards whose answer is kept; their quotes expired long ago."""
+REVOKED = "the award was revoked"
+"""Why an award is returned that an auctioneer, or a person, has revoked."""
 
 
 class AwardAccepted(msgspec.Struct, frozen=True, tag="award_accepted"):
     """The arm accepted a job."""
 
     award: Award
+
+
+class Closed(msgspec.Struct, frozen=True, tag="closed"):
+    """An award has ended, and is reported."""
+
+    report: Report
 
 
 class ReportReceived(msgspec.Struct, frozen=True, tag="report_received"):
@@ -109,7 +114,7 @@ class ActiveAward:
     """Whether the last cycle may begin, under a lease."""
     revoked: bool = False
     """No cycle may begin any more."""
-    why: str = "the award was revoked"
+    why: str = REVOKED
     """Why, if it is."""
     cycles_on_disk: int = 0
     lease_s: float = 0.0
@@ -142,7 +147,7 @@ class ArmHistory(JournalState[ArmRecord]):
     finished: dict[str, JobSpec] = field(default_factory=dict[str, JobSpec])
     """The last jobs that the arm finished, oldest first."""
     name: str = ""
-    """Of the arm; "" in a journal of an earlier version."""
+    """Of the arm."""
 
     def apply(self, record: ArmRecord) -> None:
         """Change the history as the record says."""
@@ -160,12 +165,11 @@ class ArmHistory(JournalState[ArmRecord]):
             case CommitPermitted(name):
                 if name in self.active:
                     self.active[name].may_commit = True
-            case Closed(name):
-                if name in self.active:
-                    report = report_of(record)
-                    award = self.active.pop(name).award
-                    self.reports[name] = award, report
-                    if record.outcome == "finished":
+            case Closed(report):
+                if report.award in self.active:
+                    award = self.active.pop(report.award).award
+                    self.reports[report.award] = award, report
+                    if report.outcome == "finished":
                         self._finish(award.job)
             case Released(name):
                 self.active.pop(name, None)
@@ -193,7 +197,7 @@ class ArmHistory(JournalState[ArmRecord]):
         records += [JobsFinished(tuple(self.finished.values()), self.epoch)] if self.epoch or self.finished else []
         records += [PastAward(name, job) for name, job in self.accepted.items()]
         for award, report in self.reports.values():
-            records += [AwardAccepted(award), closed(report)]
+            records += [AwardAccepted(award), Closed(report)]
         for name, active in self.active.items():
             records += [AwardAccepted(active.award), Progress(active.job, active.cycles)]
             records += [CommitPermitted(name)] if active.may_commit else []
@@ -214,13 +218,7 @@ class ArmHistory(JournalState[ArmRecord]):
         active = list(self.active.values())[:MOST_JOBS]
         awards = tuple(replace(each.award, cycles=each.cycles) for each in active)
         may_commit = tuple(each.award.award for each in active if each.may_commit)
-        history = History(arm, self.epoch, (), awards, may_commit)
-        size, finished = len(encode(history)), list[JobSpec]()
-        for job in reversed(self.finished.values()):
-            if (size := size + len(encode(job)) + 1) > MAX_BYTES:
-                break
-            finished.append(job)
-        return replace(history, finished=tuple(reversed(finished)))
+        return with_finished(History(arm, self.epoch, (), awards, may_commit), list(self.finished.values()))
 
 
 def bounded(accepted: dict[str, str], needed: Iterable[str]) -> dict[str, str]:
@@ -228,16 +226,6 @@ def bounded(accepted: dict[str, str], needed: Iterable[str]) -> dict[str, str]:
     keep = set(needed)
     keep.update([name for name in accepted if name not in keep][-MAX_PAST_AWARDS:])
     return {name: job for name, job in accepted.items() if name in keep}
-
-
-def closed(report: Report) -> Closed:
-    """Journal record of a report."""
-    return msgspec.convert(report, Closed, from_attributes=True)
-
-
-def report_of(record: Closed) -> Report:
-    """Report that a journal record was made of."""
-    return msgspec.convert(record, Report, from_attributes=True)
 
 
 _LOG = logging.getLogger(__name__)
@@ -476,10 +464,15 @@ class AwardExecutor:
         for number, active in enumerate(self.active):
             self._close(active, "returned", time_s, now_s, reason, faulted=faulted and number == 0)
 
-    def revoke(self, reason: str) -> None:
-        """Begin no more cycles of the awards without permission to commit, and return them: the arm has a break."""
+    def revoke(self, reason: str, is_stopped: Callable[[str], bool] = lambda job: True) -> None:
+        """Begin no more cycles of these jobs unless their last cycle is permitted, and return them.
+
+        Args:
+            reason: For which they are returned.
+            is_stopped: Whether a job is one of them; all are by default.
+        """
         for active in self.active:
-            if not (active.may_commit or active.revoked):
+            if is_stopped(active.job) and not (active.may_commit or active.revoked):
                 active.revoked, active.why = True, reason
 
     def return_ended(self, time_s: float, now_s: float, *, at_home: bool) -> None:
@@ -505,7 +498,7 @@ class AwardExecutor:
         report = Report(self.arm, name, active.job, outcome, active.cycles, time_s, reason, faulted=faulted)
         del self._active[name]
         self._reports[name] = _PendingReport(active.award.auctioneer, report, now_s)
-        self.write(closed(report))
+        self.write(Closed(report))
 
     # Leases
 
@@ -592,7 +585,7 @@ class AwardExecutor:
     # The disk
 
     def _unwritten_reports(self) -> set[str]:
-        return {record.award for record in self.unwritten if isinstance(record, Closed)}
+        return {record.report.award for record in self.unwritten if isinstance(record, Closed)}
 
     def write(self, record: ArmRecord) -> None:
         """Write what has already happened; without space on the disk, later."""

@@ -1,1 +1,1 @@
-"""The auctioneer: rounds, ledger, leases."""
+"""The auctioneer: rounds, awards, leases."""

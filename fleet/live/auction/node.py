@@ -1,32 +1,23 @@
-"""Epochs: an auctioneer whose journal is lost, or an older copy, must not have jobs done again that arms have done.
-
-The epoch is the name of a journal, which arms get with every award and keep on disk. Before an arm counts as present,
-the auctioneer asks what it has finished and what it has. If an arm knows another epoch, the journal was lost: no jobs
-are accepted, unless a new epoch was requested. Then the auctioneer adopts what the arms know.
-
-The auctioneer on the bus: follows which arms are present, runs the auction and publishes fleet time; one thread.
-"""
+"""The auctioneer on the bus: follows which arms are present, runs the auction and publishes fleet time; one thread."""
 
 import logging
 import math
 import secrets
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import partial
-from typing import TypeVar
-
-import msgspec
 
 from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Ack,
     Announcement,
-    Clock,
-    ClockRequest,
+    JobStatus,
+    Lease,
     LeaseRequest,
     Quote,
     QuoteRequest,
+    Receipt,
     Report,
     Result,
     Status,
@@ -34,56 +25,26 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
-from fleet.bus.protocol.cell import Cell, CellRequest
+from fleet.bus.protocol.cell import Cell
 from fleet.bus.protocol.consensus import History, HistoryRequest
 from fleet.bus.protocol.keys import SESSION_LEASE_S
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
 from fleet.errors import BusError, JournalError, JournalFull, Refused
 from fleet.live.auction.auctioneer import Auctioneer
-from fleet.live.auction.job_rules import status_reply
-from fleet.live.auction.ledger import Ledger
-from fleet.live.auction.records import AuctionRecord
-from fleet.live.auction.rounds import SCAN_S, Allocate, SendAward, Timing
+from fleet.live.auction.rounds import SCAN_S, Allocate
+from fleet.live.book import JobBook
 from fleet.live.clock import FleetClock
+from fleet.live.desk import JobDesk
+from fleet.live.doubts import replay
+from fleet.live.epochs import REMEDY, REPLY_S, ask_arms, check_begin, describe
 from fleet.live.journal import EpochBegun, Journal, Started, TimeRecorder, own_records
+from fleet.live.leases import Timing
 from fleet.live.monitor.snapshot import FRESH_S
+from fleet.live.records import BookRecord, SendAward
 from fleet.live.space import Excludes, no_conflicts
 
 _LOG = logging.getLogger(__name__)
-
-REPLY_S = 1.0
-"""Real seconds that an arm has to reply."""
-MAX_NAMED = 5
-"""Jobs that an error names."""
-REMEDY = (
-    "Stop the auctioneer and bring the journal back, or start with --new-epoch: then jobs that the arms have done are "
-    "not done again, and all other jobs of the old journal must be submitted again."
-)
-
-
-def ask_arms(link: BusClient) -> tuple[History, ...]:
-    """Return what the present arms have done and have."""
-    key = keys.of_every_arm(link.fleet, "history")
-    return tuple(link.query_and_wait(key, HistoryRequest(), History, timeout_s=REPLY_S).messages.values())
-
-
-def check_begin(fleet: str, histories: Iterable[History]) -> None:
-    """Check that no arm knows an epoch, so that an auctioneer may begin with an empty journal.
-
-    Raises:
-        BusError: an arm does.
-    """
-    for history in histories:
-        if history.epoch:
-            raise BusError(f"The journal is empty, but fleet '{fleet}' has worked: {describe(history)}. {REMEDY}")
-
-
-def describe(history: History) -> str:
-    """Return what an arm knows, in words."""
-    names = [job.name for job in history.finished[-MAX_NAMED:]]
-    done = f"{len(history.finished)} finished job(s), the last ones {', '.join(names)}" if names else "no finished job"
-    return f"'{history.arm}' knows the epoch '{history.epoch}', {done}, and has {len(history.awards)} job(s)"
 
 
 class EpochCheck:
@@ -136,10 +97,10 @@ class EpochCheck:
 
     def _accept(self, history: History) -> bool:
         """Adopt what an arm knows; return whether it fits and is on disk."""
-        ledger = self._auctioneer.ledger
-        if history.epoch not in ("", ledger.epoch) and not ledger.succeeds:
+        book = self._auctioneer.book
+        if history.epoch not in ("", book.epoch) and not book.succeeds:
             self._foreign[history.arm] = (
-                f"No jobs are accepted: the journal has the epoch '{ledger.epoch}', but {describe(history)}. {REMEDY}"
+                f"No jobs are accepted: the journal has the epoch '{book.epoch}', but {describe(history)}. {REMEDY}"
             )
             _LOG.error("%s", self._foreign[history.arm])
             return False
@@ -151,15 +112,13 @@ class EpochCheck:
         return True
 
 
-Request = TypeVar("Request", bound=msgspec.Struct)
-
 CHECK_S = 1.0
 """Real seconds between two checks for other auctioneers."""
 ALONE_S = 3.0
 """Real seconds after a check during which its result counts."""
 
 
-class AuctionNode:
+class AuctionNode(JobDesk):
     """The one auctioneer of a fleet.
 
     Attributes:
@@ -174,7 +133,7 @@ class AuctionNode:
         self,
         link: BusClient,
         name: str,
-        journal: Journal[AuctionRecord],
+        journal: Journal[BookRecord],
         *,
         allocate: Allocate,
         speed: float,
@@ -201,24 +160,24 @@ class AuctionNode:
             BusError: the fleet has an auctioneer already, or the journal is empty and arms know an older one.
             JournalError: the journal is damaged, of another auctioneer, or has no space.
         """
-        self._link, self._name, self.journal = link, name, journal
+        super().__init__(name, speed, cell)
+        self._link, self.journal = link, journal
         self._timing = timing or Timing()
-        self._cell = cell
         self._check_no_auctioneer()
-        ledger = Ledger(places, arms).replay(own_records(journal, name), journal.quarantine)
-        if not (ledger.epoch or new_epoch):
+        book = self.book = replay(JobBook(places, arms), own_records(journal, name), journal.quarantine)
+        if not (book.epoch or new_epoch):
             check_begin(link.fleet, ask_arms(link))
         real_s = time.monotonic()
-        self._recorder = TimeRecorder(journal, ledger, real_s)
+        self._recorder = TimeRecorder(journal, book, real_s)
         start_s = self._recorder.start_s(speed)
         self._clock = FleetClock(speed, real_s, start_s)
-        epoch = () if ledger.epoch else (EpochBegun(secrets.token_hex(4), start_s, succeeds=new_epoch),)
+        epoch = () if book.epoch else (EpochBegun(secrets.token_hex(4), start_s, succeeds=new_epoch),)
         begun = (Started(name, start_s), *epoch)
         journal.append(*begun)
-        ledger.replay(begun)
+        book.replay(begun)
         self.auctioneer = Auctioneer(
             name,
-            ledger,
+            book,
             allocate=allocate,
             keep=journal.append,
             boot=secrets.token_hex(4),
@@ -248,7 +207,7 @@ class AuctionNode:
     @property
     def epoch(self) -> str:
         """Name of the journal."""
-        return self.auctioneer.ledger.epoch
+        return self.book.epoch
 
     def serve(self, until_s: float) -> None:
         """Handle messages and do what is due, until `time.monotonic()` is `until_s` or slightly earlier.
@@ -272,7 +231,7 @@ class AuctionNode:
         Raises:
             Refused: no job is accepted: the journal has no space, or there is another auctioneer.
         """
-        reply = self._submit(submission, *self._now())
+        reply = self._submit(submission)
         self._send()
         return reply
 
@@ -292,67 +251,51 @@ class AuctionNode:
         return real_s, self._clock.now_s(real_s)
 
     def _declare(self) -> None:
-        link, fleet, name, auctioneer = self._link, self._link.fleet, self._name, self.auctioneer
+        link, fleet, name = self._link, self._link.fleet, self._name
         self._announce = link.publisher(keys.of_auction(fleet, name, "announce"), Announcement)
         self._result = link.publisher(keys.of_auction(fleet, name, "result"), Result)
         self._operation = link.publisher(keys.of_auction(fleet, name, "operation"), Operation)
-        renew_leases, apply_report = self._logged(auctioneer.renew_leases), self._logged(auctioneer.apply_report)
-        link.reply_to(keys.of_jobs(fleet, "submit"), Submission, self._logged(self._submit))
-        link.reply_to(keys.of_jobs(fleet, "status"), StatusRequest, self._status)
-        link.reply_to(keys.of_jobs(fleet, "clear"), ClearRequest, self._logged(self._clear))
-        link.reply_to(keys.of_jobs(fleet, "cell"), CellRequest, self._describe_cell)
-        link.reply_to(keys.of_jobs(fleet, "control"), ControlRequest, self._logged(self._control))
-        link.reply_to(keys.asked_by_every_arm(fleet, name, "lease"), LeaseRequest, renew_leases)
-        link.reply_to(keys.asked_by_every_arm(fleet, name, "report"), Report, apply_report)
-        link.reply_to(keys.of_clock(fleet), ClockRequest, lambda _: Clock(self.time_s, self._clock.speed, self.epoch))
+        self._declare_desk(link)
+        link.reply_to(keys.asked_by_every_arm(fleet, name, "lease"), LeaseRequest, self._logged(self._renew_leases))
+        link.reply_to(keys.asked_by_every_arm(fleet, name, "report"), Report, self._logged(self._apply_report))
         link.subscribe(keys.of_every_arm(fleet, "state"), State, self._apply_state)
         link.watch_tokens(keys.of_every_arm(fleet, "alive"), self._apply_token)
         link.watch_tokens(keys.of_every_auction(fleet, "alive"), self._apply_rival_token)
         link.declare_token(keys.of_auction(fleet, name, "alive"))
 
-    def _logged(self, handle: Callable[[Request, float, float], msgspec.Struct]) -> Callable[[Request], msgspec.Struct]:
-        """Return a handler of requests that passes on the time, and logs what is refused."""
+    def _renew_leases(self, request: LeaseRequest) -> Lease:
+        return self.auctioneer.renew_leases(request, *self._now())
 
-        def reply(request: Request) -> msgspec.Struct:
-            try:
-                return handle(request, *self._now())
-            except Refused as error:
-                _LOG.warning("Refused: %s", error)
-                raise
+    def _apply_report(self, report: Report) -> Receipt:
+        return self.auctioneer.apply_report(report, *self._now())
 
-        return reply
+    def _check_first(self) -> None:
+        """Reply always: an auctioneer finds another one by its replies."""
 
-    def _submit(self, submission: Submission, real_s: float, time_s: float) -> SubmissionReply:
+    def _check_alone(self, vain: str) -> None:
         if self.rivals:
-            raise Refused(f"{self._name_rivals()}: no jobs are accepted until one is stopped.")
+            raise Refused(f"{self._name_rivals()}: {vain} until one is stopped.")
+
+    def _submit(self, submission: Submission) -> SubmissionReply:
+        self._check_alone("no jobs are accepted")
         if self._epochs.objection:
             raise Refused(self._epochs.objection)
-        return self.auctioneer.submit(submission, real_s, time_s)
+        return self.auctioneer.submit(submission, *self._now())
 
-    def _clear(self, request: ClearRequest, real_s: float, time_s: float) -> Cleared:
-        if self.rivals:
-            raise Refused(f"{self._name_rivals()}: no space is cleared until one is stopped.")
-        return self.auctioneer.clear(request, self.present, time_s)
+    def _clear(self, request: ClearRequest) -> Cleared:
+        self._check_alone("no space is cleared")
+        return self.auctioneer.clear(request, self.present, self.time_s)
 
-    def _control(self, request: ControlRequest, real_s: float, time_s: float) -> Controlled:
-        if self.rivals:
-            raise Refused(f"{self._name_rivals()}: nothing is changed until one is stopped.")
-        return self.auctioneer.control(request, time_s)
+    def _control(self, request: ControlRequest) -> Controlled:
+        self._check_alone("nothing is changed")
+        return self.auctioneer.control(request, self.time_s)
 
-    def _describe_cell(self, _: CellRequest) -> Cell:
-        if self._cell is None:
-            raise Refused("This auctioneer knows no cell.")
-        return self._cell
-
-    def _status(self, request: StatusRequest) -> Status:
-        auctioneer = self.auctioneer
-        taken = auctioneer.ledger.taken_space()
-        paused = auctioneer.ledger.paused
-        return status_reply(self._name, self.time_s, auctioneer.status(request.jobs), taken, self.epoch, paused)
+    def _statuses(self, names: tuple[str, ...]) -> tuple[JobStatus, ...]:
+        return self.auctioneer.status(names)
 
     def _apply_state(self, arm: str, state: State) -> None:
         # An arm outside the cell may be anywhere: without a token it would stop all others, and nobody could ask it.
-        if arm in self._tokens or arm in self.auctioneer.ledger.arms:
+        if arm in self._tokens or arm in self.book.arms:
             self._state_s[arm] = time.monotonic()
             self.auctioneer.apply_state(arm, state)
 

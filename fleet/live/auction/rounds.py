@@ -1,26 +1,21 @@
 """One round of an auction: its time limits, the bids of the arms, and which arm gets which job.
 
-New and adopted awards, and leases of open ones as the auctioneer counts them.
-
-Ledger of an auctioneer with the leases of its open awards: a record is on disk before it changes anything.
-
-Space in an auction: what quotes say about it, which estimates it closes, and whose space a person may free.
+Space in an auction: what quotes say about it, and which estimates it closes.
 
 Rounds of an auction: which jobs are offered when, to whom, and what is awarded.
 """
 
 import logging
 import math
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
-from msgspec.structs import asdict, replace
+from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import (
-    LEASE_S,
     MOST_OFFERS,
     NOT_PLANNED,
     Announcement,
@@ -33,15 +28,14 @@ from fleet.bus.protocol.auction import (
     QuoteRequest,
     Result,
 )
-from fleet.bus.protocol.consensus import History
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import ALL_ARMS, ClearRequest, Operation
-from fleet.errors import JournalFull, Refused
-from fleet.live.auction.job_rules import is_same_work, why_not_ready
-from fleet.live.auction.ledger import Ledger
-from fleet.live.auction.records import AuctionRecord, Awarded, HistoryAdopted, JobChange, Operated
-from fleet.live.clock import CLOCK_DRIFT
-from fleet.live.journal import Closed, CommitPermitted, JobsAccepted, SpaceCleared, SpaceTaken
+from fleet.bus.protocol.operator import ALL_ARMS, Operation
+from fleet.errors import JournalFull
+from fleet.live.book import JobBook
+from fleet.live.job_rules import why_not_ready
+from fleet.live.journal import SpaceTaken
+from fleet.live.leases import Timing, unanswered
+from fleet.live.records import CountedLease, Granted, SendAward
 from fleet.live.sensors import ArmSensors
 from fleet.live.space import ANYWHERE, Excludes, arms_in_the_way, no_conflicts
 
@@ -49,38 +43,6 @@ _LOG = logging.getLogger(__name__)
 
 MAX_REASON = 500
 """Characters of a reason, so that a message does not grow with the number of arms."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Timing:
-    """Auction timeouts, in real seconds."""
-
-    lease_s: float = LEASE_S
-    """Length of a lease: an arm may work this long without renewing it."""
-    margin_s: float = 0.25
-    """Between the end of a lease and the next offer of its job."""
-    window_s: float = 0.5
-    """A round closes after this, if not every arm has answered before."""
-    ack_s: float = 1.0
-    """To wait for the answer to an award."""
-    attempts: int = 3
-    """Maximum number of times that an award is sent."""
-    pause_s: tuple[float, float] = (0.25, 2.0)
-    """Between rounds in which nothing was awarded: the first pause and the longest."""
-    max_jobs: int = 64
-    """Jobs in one round; a quote for more would be a large message."""
-
-    def __post_init__(self) -> None:
-        for name in ("lease_s", "margin_s", "window_s", "ack_s", "attempts", "max_jobs"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"Timing.{name} must be > 0 (got {getattr(self, name)}).")
-        if not 0 < self.pause_s[0] <= self.pause_s[1]:
-            raise ValueError(f"Timing.pause_s must be 0 < first <= longest (got {self.pause_s}).")
-
-    @property
-    def counted_lease_s(self) -> float:
-        """Length of a lease as the granting side counts it: longer than the arm does, as clocks differ in rate."""
-        return self.lease_s * (1.0 + CLOCK_DRIFT) + self.margin_s
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,152 +270,60 @@ class Round:
         return (self.asked & present) <= self.quotes.keys()
 
 
-@dataclass(frozen=True)
-class SendAward:
-    """Send this award to its arm."""
-
-    arm: str
-    award: Award
-
-
-@dataclass(eq=False)
-class CountedLease:
-    """Lease of an open award, as the auctioneer counts it."""
-
-    until_s: float
-    """Real second at which it ends."""
-    cycles: int = 0
-    """Last reported progress."""
-    unanswered: SendAward | None = None
-    """The award, until its arm answers."""
-    sent_s: float = -math.inf
-    attempts: int = 1
-
-
-def unanswered(leases: Mapping[str, CountedLease]) -> list[tuple[CountedLease, SendAward]]:
-    """Return the leases of awards that their arms have not answered, and these awards."""
-    return [(lease, lease.unanswered) for lease in leases.values() if lease.unanswered is not None]
-
-
-def send_again(leases: Mapping[str, CountedLease], real_s: float, timing: Timing) -> list[SendAward]:
-    """Return the unanswered awards that are due to be sent again; they count as sent."""
-    due: list[SendAward] = []
-    for lease, message in unanswered(leases):
-        if real_s >= lease.sent_s + timing.ack_s and lease.attempts < timing.attempts:
-            lease.sent_s, lease.attempts = real_s, lease.attempts + 1
-            due.append(message)
-    return due
-
-
-def new_awards(ledger: Ledger, bidding: Bidding, allocation: Mapping[str, Assignment], time_s: float) -> list[Awarded]:
+def new_awards(book: JobBook, bidding: Bidding, allocation: Mapping[str, Assignment], time_s: float) -> list[Granted]:
     """Return the records of the awards of a round."""
-    records: list[Awarded] = []
+    records: list[Granted] = []
     for job, (arm, plan) in allocation.items():
-        offer = bidding.offer(arm, job, plan)
+        offer, entry = bidding.offer(arm, job, plan), book.jobs[job]
         assert offer is not None, "drop_invalid keeps jobs with a bid"
-        names = (f"{bidding.auction}:{job}", bidding.auction, job, arm, bidding.quotes[arm].quote)
-        heat = (offer.difficulty, offer.p_saturation, offer.peak_c)
-        terms = (ledger.jobs[job].cycles, time_s, *heat, offer.space or ANYWHERE, plan)
-        records.append(Awarded(*names, *terms, offers_of(bidding, job, Assignment(arm, plan))))
+        assert entry.spec is not None, "a job of a round is known"
+        award = Granted(
+            f"{bidding.auction}:{job}",
+            job,
+            arm,
+            time_s,
+            cycles=entry.cycles,
+            places=entry.spec.stations,
+            space=offer.space or ANYWHERE,
+            auction=bidding.auction,
+            quote=bidding.quotes[arm].quote,
+            plan=plan,
+            difficulty=offer.difficulty,
+            p_saturation=offer.p_saturation,
+            peak_c=offer.peak_c,
+            offers=offers_of(bidding, job, Assignment(arm, plan)),
+        )
+        records.append(award)
     return records
-
-
-def adopted(ledger: Ledger, history: History, name: str, time_s: float) -> list[AuctionRecord]:
-    """Return what an auctioneer takes over from an arm: jobs that it finished, and awards that it has.
-
-    Args:
-        name: Name of the auctioneer; an arm leases the awards of another one there.
-    """
-    records: list[AuctionRecord] = []
-    waiting = {job: entry.spec for job, entry in ledger.waiting.items()}
-
-    def is_waiting(job: JobSpec) -> bool:
-        return job.name in waiting and is_same_work(waiting[job.name], job)
-
-    unknown = tuple(
-        job
-        for job in history.finished
-        if is_waiting(job) or (job.name not in ledger.jobs and job.name not in ledger.past)
-    )
-    if unknown:
-        records.append(HistoryAdopted(history.arm, unknown, time_s))
-    done = {job.name for job in unknown}
-    for award in history.awards:
-        job = award.job
-        fresh = job.name not in ledger.jobs and job.name not in ledger.past and job.name not in done
-        if award.auctioneer != name or award.award in ledger.awards or not (fresh or is_waiting(job)):
-            continue
-        if fresh:
-            records.append(JobsAccepted((job,), f"adopted from {history.arm}", time_s))
-        records.append(_awarded(award, history.arm, time_s))
-        if award.award in history.may_commit:
-            records.append(CommitPermitted(award.award, time_s))
-    return records
-
-
-def _awarded(award: Award, arm: str, time_s: float) -> Awarded:
-    terms = (award.award, award.auction, award.job.name, arm, award.quote, award.cycles, time_s)
-    return Awarded(*terms, plan=award.plan)
 
 
 Out = QuoteRequest | SendAward | Announcement | Result | Operation
 
 
-class LedgerWriter:
-    """Writes records, applies them, and announces the changes.
+def space_of(book: JobBook, awards: Iterable[str], arm: str) -> set[str]:
+    """Return the names of the spaces of an arm's awards; unknown awards have none."""
+    grants = (book.grant_of(award) for award in awards)
+    return {grant.record.space for grant in grants if grant is not None and grant.record.arm == arm}
 
-    Attributes:
-        ledger: Jobs and awards.
-        leases: Leases of the open awards.
-        out: Messages to send, oldest first.
+
+def closed_space(book: JobBook) -> Mapping[str, frozenset[str]]:
+    """Return the names of the spaces that each arm may take for ended grants alone."""
+    still_open: dict[str, set[str]] = {}
+    for grant in book.open.values():
+        still_open.setdefault(grant.record.arm, set()).add(grant.record.space)
+    return {arm: names - still_open.get(arm, set()) for arm, names in book.space.items()}
+
+
+def retaken_space(book: JobBook, arm: str, space: Set[str]) -> list[SpaceTaken]:
+    """Return what changes when an arm takes this space; it counts as free after a person has freed it.
+
+    Args:
+        space: Names of spaces that the arm takes, or for which it has an award.
     """
-
-    def __init__(self, name: str, ledger: Ledger, keep: Callable[..., None], counted_until_s: float) -> None:
-        """Start with a ledger.
-
-        Args:
-            name: Of the auctioneer.
-            keep: Writes records; returns when they are on disk, or raises `JournalError` and has written none.
-            counted_until_s: Real second until which its open awards count as leased.
-        """
-        self.ledger = ledger
-        self.leases = {award: CountedLease(counted_until_s) for award in ledger.open}
-        self._name, self._keep = name, keep
-        self.out: deque[Out] = deque(self._result(change) for change in ledger.recent)
-        first = ledger.operated - len(ledger.operations)
-        self.out.extend(self._operation(record, first + place) for place, record in enumerate(ledger.operations))
-
-    def record(self, *records: AuctionRecord) -> None:
-        """Write records, then apply them.
-
-        Raises:
-            JournalError: nothing was written, and nothing has changed.
-        """
-        if not records:
-            return
-        records = (*self.ledger.checks_due(), *records)
-        self._keep(*records)
-        for record in records:
-            self.out.extend(map(self._result, self.ledger.apply(record)))
-            if isinstance(record, Operated):
-                self.out.append(self._operation(record, self.ledger.operated - 1))
-        for award in self.leases.keys() - self.ledger.open.keys():
-            del self.leases[award]
-
-    def try_to_record(self, failure: str, *records: AuctionRecord) -> bool:
-        """Record; return whether that is on disk, and log the failure if not."""
-        try:
-            self.record(*records)
-        except JournalFull as error:
-            _LOG.error("%s: %s", failure, error)
-            return False
-        return True
-
-    def _result(self, change: JobChange) -> Result:
-        return Result(self._name, epoch=self.ledger.epoch, **asdict(change))
-
-    def _operation(self, record: Operated, number: int) -> Operation:
-        return Operation(self._name, record.time_s, record.request, number, self.ledger.epoch)
+    taken = book.taken_space().get(arm, frozenset())
+    if ANYWHERE in taken or space <= taken:
+        return []
+    return [SpaceTaken(arm, tuple(sorted(book.space.get(arm, frozenset()) | space)), book.time_s)]
 
 
 def _stated_space(quote: Quote) -> frozenset[str]:
@@ -463,63 +333,19 @@ def _stated_space(quote: Quote) -> frozenset[str]:
     return frozenset(quote.space)
 
 
-def stated_spaces(ledger: Ledger, closing: Round, time_s: float) -> list[SpaceTaken]:
+def stated_spaces(book: JobBook, closing: Round, time_s: float) -> list[SpaceTaken]:
     """Return what the quotes of a round change in the space that arms take.
 
     A quote says nothing about awards that were closed after the round was opened: these keep their space.
     """
     records: list[SpaceTaken] = []
     for arm, quote in sorted(closing.quotes.items()):
-        before = ledger.space.get(arm, frozenset())
-        open_space = {award.record.space for award in ledger.open.values() if award.record.arm == arm}
+        before = book.space.get(arm, frozenset())
+        open_space = {grant.record.space for grant in book.open.values() if grant.record.arm == arm}
         after = (before - closing.space.get(arm, frozenset())) | (_stated_space(quote) - open_space)
         if after != before:
             records.append(SpaceTaken(arm, tuple(sorted(after)), time_s))
     return records
-
-
-def retaken_space(ledger: Ledger, arm: str, space: Set[str]) -> list[SpaceTaken]:
-    """Return what changes when an arm takes this space; it counts as free after a person has freed it.
-
-    Args:
-        space: Names of spaces that the arm takes, or for which it has an award.
-    """
-    taken = ledger.taken_space().get(arm, frozenset())
-    if ANYWHERE in taken or space <= taken:
-        return []
-    return [SpaceTaken(arm, tuple(sorted(ledger.space.get(arm, frozenset()) | space)), ledger.time_s)]
-
-
-def cleared_space(
-    ledger: Ledger,
-    request: ClearRequest,
-    present: frozenset[str],
-    cycles: Mapping[str, int],
-    lease_s: float,
-    time_s: float,
-) -> list[Closed | SpaceCleared]:
-    """Return what changes when a person frees the space of an arm: its awards end, each may be done or not.
-
-    Args:
-        cycles: Reported progress, by award.
-
-    Raises:
-        Refused: the arm is unknown, or present, or may have a lease.
-    """
-    arm, taken = request.arm, ledger.taken_space()
-    awards = {name: award for name, award in ledger.open.items() if award.record.arm == arm}
-    if arm in present:
-        raise Refused(f"'{arm}' is present and says itself which space it takes. Stop it first, or move it home.")
-    if arm not in ledger.space and not awards:
-        arms = ", ".join(sorted(name for name, spaces in taken.items() if spaces))
-        raise Refused(f"'{arm}' takes no space. Arms that do: {arms or 'none'}.")
-    if not all(award.silent for award in awards.values()):
-        raise Refused(f"The lease of '{arm}' has not ended; try again in {lease_s:g} s.")
-    if not taken.get(arm):
-        return []
-    reason = f"The space of '{arm}' was cleared; it was about to finish it."[:MAX_REASON]
-    ends = [Closed(name, "dropped", cycles.get(name, 0), time_s, reason, unsure=True) for name in awards]
-    return [*ends, SpaceCleared(arm, request.by, time_s)]
 
 
 SCAN_S = 0.05
@@ -541,14 +367,21 @@ class Rounds:
     """
 
     def __init__(
-        self, name: str, writer: LedgerWriter, allocate: Allocate, timing: Timing, excludes: Excludes, boot: str
+        self,
+        name: str,
+        book: JobBook,
+        allocate: Allocate,
+        timing: Timing,
+        excludes: Excludes,
+        boot: str,
+        send: Callable[[Out], object],
     ) -> None:
         """Start; arguments as of `fleet.live.auction.auctioneer.Auctioneer`."""
         self.open: Round | None = None
         self.states: dict[str, State] = {}
         self.sensors: defaultdict[str, ArmSensors] = defaultdict(ArmSensors)
         self.present: frozenset[str] = frozenset()
-        self._name, self._writer, self.allocate = name, writer, allocate
+        self._name, self._book, self.allocate, self._send = name, book, allocate, send
         self._timing, self._excludes, self._boot = timing, excludes, boot
         self._count = 0
         self._later_s: dict[str, float] = {}
@@ -582,14 +415,14 @@ class Rounds:
         Args:
             busy: Stations at which an arm may be at work.
         """
-        ledger = self._writer.ledger
-        if (pauser := ledger.paused.get(ALL_ARMS)) is not None:
+        book = self._book
+        if (pauser := book.operations.paused.get(ALL_ARMS)) is not None:
             return f"All arms are paused by '{pauser}'."
         if not self.present:
             return "No arm is present."
-        if all(map(ledger.is_paused, self.present)):
+        if all(map(book.is_paused, self.present)):
             return "All present arms are paused."
-        reason = why_not_ready(job, self._time_s, ledger.is_finished, busy)
+        reason = why_not_ready(job, self._time_s, book.is_finished, busy)
         return reason or self._notes.get(job.name, NOT_OFFERED.format(self._timing.max_jobs))
 
     def is_planned(self, job: str) -> bool:
@@ -610,30 +443,30 @@ class Rounds:
     # Inside
 
     def _begin(self, real_s: float, time_s: float) -> None:
-        waiting = unanswered(self._writer.leases)
-        ledger = self._writer.ledger
-        able = {arm for arm in self.present if not ledger.is_paused(arm)}
+        waiting = unanswered(self._book.leases)
+        book = self._book
+        able = {arm for arm in self.present if not book.is_paused(arm)}
         bidders = frozenset(able - {message.arm for _, message in waiting})
         if any(real_s < lease.sent_s + self._timing.window_s for lease, _ in waiting):
             return
         self._later_s = {job: at_s for job, at_s in self._later_s.items() if at_s > real_s}
-        self._notes = {job: note for job, note in self._notes.items() if job in ledger.waiting}
-        self._planned &= ledger.waiting.keys()
-        jobs = tuple(ledger.ready(time_s, self._timing.max_jobs, excluded=self._later_s))
-        busy = ledger.busy_stations()
+        self._notes = {job: note for job, note in self._notes.items() if job in book.waiting}
+        self._planned &= book.waiting.keys()
+        jobs = tuple(book.ready(time_s, self._timing.max_jobs, excluded=self._later_s))
+        busy = book.busy_stations()
         if not (bidders and any(busy.isdisjoint(job.stations) for job in jobs)):
             self._ask_for_space(real_s)
             return
         auction = self._open(jobs, bidders, real_s)
-        self._writer.out.append(Announcement(self._name, auction, time_s, tuple(job.name for job in jobs)))
-        cycles = {job.name: done for job in jobs if (done := self._writer.ledger.jobs[job.name].cycles)}
-        self._writer.out.append(QuoteRequest(auction, jobs, cycles=cycles))
+        self._send(Announcement(self._name, auction, time_s, tuple(job.name for job in jobs)))
+        cycles = {job.name: done for job in jobs if (done := self._book.jobs[job.name].cycles)}
+        self._send(QuoteRequest(auction, jobs, cycles=cycles))
 
     def _open(self, jobs: tuple[JobSpec, ...], asked: frozenset[str], real_s: float) -> str:
         """Open a round; return its name."""
         self._count += 1
         auction = f"{self._name}-{self._boot}-{self._count}"
-        self.open = Round(auction, jobs, asked, real_s + self._timing.window_s, self._writer.ledger.closed_space())
+        self.open = Round(auction, jobs, asked, real_s + self._timing.window_s, closed_space(self._book))
         return auction
 
     def _ask_for_space(self, real_s: float) -> None:
@@ -642,32 +475,32 @@ class Rounds:
         Otherwise the space of an arm without a next job would stay closed, also when the arm has left. Only a quote
         frees it: a state may have been sent before the award. The quote is a dry run of the last job that was changed.
         """
-        ledger = self._writer.ledger
-        takes_space = frozenset(arm for arm, names in ledger.closed_space().items() if names) & self.present
+        book = self._book
+        takes_space = frozenset(arm for arm, names in closed_space(book).items() if names) & self.present
         if not takes_space or real_s < self._space_s:
             return
-        last = ledger.jobs.get(ledger.recent[-1].status.job) if ledger.recent else None
-        job = NO_JOB if last is None else last.spec
+        last = book.jobs.get(book.recent[-1].status.job) if book.recent else None
+        job = NO_JOB if last is None or last.spec is None else last.spec
         self._space_s = real_s + self._space_pause_s
         self._space_pause_s = min(2 * self._space_pause_s, self._timing.pause_s[1])
         auction = self._open((), takes_space, real_s)
-        self._writer.out.append(QuoteRequest(auction, (job,), dry_run=True))
+        self._send(QuoteRequest(auction, (job,), dry_run=True))
 
     def _close(self, closing: Round, real_s: float, time_s: float) -> None:
         self.open = None
-        spaces, before = stated_spaces(self._writer.ledger, closing, time_s), self._writer.ledger.space
+        spaces, before = stated_spaces(self._book, closing, time_s), self._book.space
         freed = any(frozenset(each.space) < before.get(each.arm, frozenset()) for each in spaces)
-        if not self._writer.try_to_record("Nothing is awarded", *spaces):
+        if not self._book.try_to_record("Nothing is awarded", *spaces):
             self.delay(real_s, (job.name for job in closing.jobs))
             return
         if not closing.jobs:
             if freed:
                 self.retry_now()
             return
-        waiting = self._writer.ledger.waiting  # a job may have been settled meanwhile, and have left
+        waiting = self._book.waiting  # a job may have been settled meanwhile, and have left
         entries = [waiting[job.name] for job in closing.jobs if job.name in waiting]
         entries = [entry for entry in entries if entry.spec in closing.jobs]
-        jobs = tuple(entry.spec for entry in entries)
+        jobs = tuple(entry.spec for entry in entries if entry.spec is not None)
         quotes = {
             arm: self.sensors[arm].check_quote(quote)
             for arm, quote in closing.quotes.items()
@@ -680,9 +513,9 @@ class Rounds:
             {arm: quote for arm, quote in quotes.items() if quote.capacity},
             {arm: quote for arm, quote in quotes.items() if not quote.capacity},
             states=self.states,
-            returned={entry.spec.name: (len(entry.faults), entry.returned_s) for entry in entries if entry.returns},
-            busy=self._writer.ledger.busy_stations(),
-            taken=self._writer.ledger.taken_space(),
+            returned={entry.name: (len(entry.faults), entry.returned_s) for entry in entries if entry.returns},
+            busy=self._book.busy_stations(),
+            taken=self._book.taken_space(),
             excludes=self._excludes,
         )
         self._planned |= planned_jobs(quotes)
@@ -701,16 +534,16 @@ class Rounds:
             self.delay(real_s, (job.name for job in closing.jobs))
 
     def _may_work(self, arm: str, closing: Round) -> bool:
-        return arm in closing.asked & self.present and not self._writer.ledger.is_paused(arm)
+        return arm in closing.asked & self.present and not self._book.is_paused(arm)
 
     def _award(self, bidding: Bidding, allocation: dict[str, Assignment], real_s: float, time_s: float) -> None:
-        self._writer.record(*(records := new_awards(self._writer.ledger, bidding, allocation, time_s)))
+        self._book.record(*(records := new_awards(self._book, bidding, allocation, time_s)))
+        specs = {job.name: job for job in bidding.jobs}
         for record in records:
             self._notes.pop(record.job, None)
-            spec = self._writer.ledger.jobs[record.job].spec
-            terms = (record.quote, spec, record.cycles, self._timing.lease_s, record.plan)
-            award = Award(record.award, bidding.auction, self._name, *terms, epoch=self._writer.ledger.epoch)
+            terms = (record.quote, specs[record.job], record.cycles, self._timing.lease_s, record.plan)
+            award = Award(record.award, bidding.auction, self._name, *terms, epoch=self._book.epoch)
             message = SendAward(record.arm, award)
             until_s = real_s + self._timing.counted_lease_s
-            self._writer.leases[record.award] = CountedLease(until_s, unanswered=message, sent_s=real_s)
-            self._writer.out.append(message)
+            self._book.leases[record.award] = CountedLease(until_s, unanswered=message, sent_s=real_s)
+            self._send(message)

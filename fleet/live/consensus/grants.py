@@ -1,18 +1,7 @@
 """Grants of an arm to its peers.
 
-A state machine without a clock and without I/O. Real time is an argument. Records go to `keep`, which returns once they
-are on disk, and are applied only then. The rules that make it safe (`fleet.bus.protocol.consensus` says why):
-
-- A job is granted to one arm at a time; to another arm only after the lease of the first has ended, or the first has
-  released the job.
-- While a job is granted, no other job at one of its stations is.
-- Permission to commit, that is to begin the last cycle, is granted once and stays, unless its arm releases the job.
-- A settled job is granted to no arm.
-- Of two plans that exclude each other one is granted. Its arm takes the space until a later claim of the arm says that
-  it does not take it any more, or a person frees it. An arm without a claim may be anywhere.
-- Whoever frees the space of an arm also revokes its grants: the arm gets no lease on them any more, and returns them.
-- A person's cancellation ends the leases of a job, except for an arm with permission to commit.
-- After a crash every grant counts as leased from the restart.
+A state machine without a clock and without I/O. Real time is an argument. The rules that make it safe are at
+the head of `fleet.live.book`; the quorum is a majority of the roster.
 
 Claims of an arm, and what follows from the replies of a majority.
 
@@ -24,23 +13,34 @@ misses a job there that it has granted knows that the arm has released it.
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 from msgspec.structs import replace
 
-from fleet.bus.protocol.auction import MOST_JOBS, Ack, Award, JobSpec, JobStatus, Lease, Receipt, Report
+from fleet.bus.protocol.auction import MOST_JOBS, Ack, Award, JobSpec, Lease, Receipt
 from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, DeniedEntry, Faults, GrantedEntry, JobOutcome
-from fleet.bus.protocol.operator import Operation
+from fleet.bus.protocol.operator import ALL_ARMS, Operation, Pause, Resume
 from fleet.errors import JournalError, JournalFull, Refused
 from fleet.job import reason_to_give_up
-from fleet.live.arm.awards import ActiveAward, AwardExecutor
-from fleet.live.auction.auctioneer import job_of
-from fleet.live.auction.job_rules import MAX_OPEN_JOBS, reason_for_silence
-from fleet.live.auction.ledger import MAX_SETTLED
-from fleet.live.auction.rounds import Timing
-from fleet.live.consensus.jobs import Faulted, GrantRecord, JobGranted, JobSettled, Register, Requested, is_for
-from fleet.live.journal import EpochBegun, JobsAccepted, Released, SpaceCleared, SpaceTaken
+from fleet.live.arm.awards import REVOKED, ActiveAward, AwardExecutor
+from fleet.live.book import MAX_SETTLED, JobBook
+from fleet.live.job_rules import MAX_OPEN_JOBS
+from fleet.live.journal import JobsAccepted, Progress, Released, SpaceTaken
+from fleet.live.leases import Timing, clear, expire, renewal
+from fleet.live.records import (
+    BookRecord,
+    ClaimNumbered,
+    CountedLease,
+    Faulted,
+    Granted,
+    JobEntry,
+    JobSettled,
+    Requested,
+    cancelled_by,
+    outcome_of,
+    requested_job,
+)
 from fleet.live.space import ANYWHERE, Excludes, arms_in_the_way, no_conflicts
 
 
@@ -48,33 +48,32 @@ class Granter:
     """Grants of one arm to its peers.
 
     Attributes:
-        register: The state on its disk.
+        book: The state on its disk.
     """
 
     def __init__(
         self,
         arm: str,
         roster: Iterable[str],
-        register: Register,
+        book: JobBook,
         keep: Callable[..., None],
         *,
         real_s: float,
         timing: Timing | None = None,
         excludes: Excludes = no_conflicts,
     ) -> None:
-        """Start with the grants of a register.
+        """Start with the grants of a book.
 
         Args:
             roster: All arms of the fleet, present or not.
             keep: Writes records; returns when they are on disk, or raises `JournalError` and has written none.
         """
         self.arm, self.roster = arm, frozenset(roster)
-        self.register = register
-        self._keep, self._timing, self._excludes = keep, timing or Timing(), excludes
+        self.book, self.timing, self._excludes = book, timing or Timing(), excludes
+        book.name = arm
         for each in self.roster:
-            register.space.setdefault(each, frozenset([ANYWHERE]))
-        for grant in register.grants.values():
-            grant.until_s = real_s + self._timing.counted_lease_s
+            book.space.setdefault(each, frozenset([ANYWHERE]))
+        book.attach(keep, real_s + self.timing.counted_lease_s)
 
     def answer_claim(self, claim: Claim, real_s: float) -> ClaimReply:
         """Return the reply to a claim; every grant in it is on disk.
@@ -82,52 +81,56 @@ class Granter:
         Raises:
             Refused: an arm of another fleet, a claim older than the latest of that arm, or a full journal.
         """
-        register = self.register
+        book = self.book
         if claim.arm not in self.roster:
             raise Refused(f"'{claim.arm}' is no arm of this fleet. Arms: {', '.join(sorted(self.roster))}.")
-        last = register.numbers.get(claim.arm, -1)
+        last = book.numbers.get(claim.arm, -1)
         if claim.number <= last:
             raise Refused(f"Stale claim {claim.number} from '{claim.arm}' (latest {last}).")
         self.add_jobs(claim.jobs)
-        self._record([JobSettled(outcome) for outcome in claim.outcomes if self._is_new(outcome)])
-        self._record(self._released(claim))
+        for outcome in claim.outcomes:
+            self.apply_outcome(outcome)
+        kept = {entry.award for entry in claim.entries}
+        its = (grant.record for grant in book.grants_of(claim.arm))
+        released = [each for each in its if each.award not in kept]
+        self._record(claim, *(Released(each.award, each.job, each.arm, time_s=book.time_s) for each in released))
         for operation in claim.operations:
             self.operate(operation)
-        self.abandon(real_s)
+        expire(book, real_s, book.time_s)
         self._set_space(claim)
-        register.numbers[claim.arm] = claim.number
+        book.numbers[claim.arm] = claim.number
         granted: list[GrantedEntry] = []
         denied: list[DeniedEntry] = []
         for entry in claim.entries:
-            reason = self._objection(claim.arm, entry, real_s) or self._grant(claim, entry, real_s)
-            if reason:
-                denied.append(DeniedEntry(entry.award, reason, register.settled.known(entry.job, self.arm)))
+            if reason := self._objection(claim.arm, entry, real_s) or self._grant(claim, entry, real_s):
+                denied.append(DeniedEntry(entry.award, reason, self.known_outcome(entry.job)))
             else:
-                may_commit = register.grants[entry.job].may_commit
-                cycles, faults = register.cycles.get(entry.job, 0), register.faults.get(entry.job, {})
-                granted.append(GrantedEntry(entry.award, cycles, may_commit, faults))
-        return ClaimReply(self.arm, claim.number, self._timing.lease_s, tuple(granted), tuple(denied))
+                job = book.jobs[entry.job]
+                may_commit = job.grant is not None and job.grant.may_commit
+                granted.append(GrantedEntry(entry.award, job.cycles, may_commit, dict(job.faults)))
+        return ClaimReply(self.arm, claim.number, self.timing.lease_s, tuple(granted), tuple(denied))
 
     def clear(self, arm: str, by: str, present: frozenset[str], real_s: float, time_s: float) -> None:
-        """Free the space of an absent arm and revoke its grants: a person has seen that it is at home, or removed.
+        """Free the space of an absent arm and revoke its grants, as `clear`.
 
         Raises:
             Refused: the arm is unknown, or present, or may have a lease.
-            JournalError: it is not on disk, and nothing has changed.
         """
-        grants = self.register.grants.values()
         if arm not in self.roster:
             raise Refused(f"'{arm}' is no arm of this fleet. Arms: {', '.join(sorted(self.roster))}.")
-        if arm in present:
-            raise Refused(f"'{arm}' is present and says itself which space it takes. Stop it first, or move it home.")
-        if any(grant.arm == arm and real_s < grant.until_s for grant in grants):
-            raise Refused(f"The lease of '{arm}' has not ended; try again in {self._timing.lease_s:g} s.")
-        if self.register.space[arm]:
-            self._record([SpaceCleared(arm, by, time_s)])
+        expire(self.book, real_s, time_s)
+        clear(self.book, arm, by, present, self.timing.lease_s, time_s)
 
     def in_the_way(self, arm: str, space: str | None) -> tuple[str, ...]:
         """Return the arms that take a space which excludes this one of an arm."""
-        return arms_in_the_way(arm, space, self.register.space, self._excludes)
+        return arms_in_the_way(arm, space, self.book.taken_space(), self._excludes)
+
+    def known_outcome(self, job: str) -> JobOutcome | None:
+        """Return the outcome of a job, also of one that has left, as this arm knows it; None for none."""
+        if job in self.book.jobs or job not in self.book.past:
+            return self.book.jobs[job].outcome if job in self.book.jobs else None
+        outcome = "finished" if self.book.past.is_finished(job) else "given_up"
+        return JobOutcome(job, "?", self.arm, outcome, 0, 0.0, f"It was {outcome.replace('_', ' ')} long ago.")
 
     def apply_outcome(self, outcome: JobOutcome) -> None:
         """Record the outcome of a job that a peer knows.
@@ -135,50 +138,19 @@ class Granter:
         Raises:
             JournalError: it is not on disk, and nothing has changed.
         """
-        if self._is_new(outcome):
-            self._record([JobSettled(outcome)])
+        if self.book.is_news(outcome):
+            self.book.record(JobSettled(outcome))
 
     def operate(self, operation: Operation) -> None:
-        """Record a request of a person, which was carried out by this arm or a peer.
+        """Record a request of a person, which a peer has carried out.
 
         Raises:
             JournalError: it is not on disk, and nothing has changed.
         """
-        operations = self.register.operations
-        known = operation.request.request in operations.names
-        past = job_of(operation.request) in self.register.past
-        if not past and is_for(operation, self.roster) and not (known and not operations.is_new(operation)):
-            self._record([Requested(operation)])
-
-    def settle(self, operation: Operation, award: str, cycles: int) -> JobOutcome:
-        """Record that a person calls a job of so many cycles done, and return its outcome.
-
-        Raises:
-            JournalError: it is not on disk, and nothing has changed.
-        """
-        job, by = job_of(operation.request), operation.request.by
-        award, arm = award or operation.request.request, self.register.last_arm.get(job, operation.auctioneer)
-        reason = f"Settled as done by '{by}'."
-        outcome = JobOutcome(job, award, arm, "finished", cycles, operation.time_s, reason)
-        self._record([JobSettled(outcome)])
-        return outcome
-
-    def give_up(self, lost: Mapping[str, str], time_s: float) -> None:
-        """Record jobs as given up for these reasons, so that they can leave.
-
-        Raises:
-            JournalError: they are not on disk, and nothing has changed.
-        """
-        outcomes = (JobOutcome(job, "?", self.arm, "given_up", 0, time_s, reason) for job, reason in lost.items())
-        self._record([JobSettled(outcome) for outcome in outcomes])
-
-    def abandon(self, real_s: float) -> None:
-        """Record the outcomes of jobs that no arm has, and that are cancelled or in which arms have faulted too often.
-
-        Raises:
-            JournalError: they are not on disk, and nothing has changed.
-        """
-        self._record([*self._given_up(real_s), *self._cancelled(real_s)])
+        action = operation.request.action
+        ours = not isinstance(action, Pause | Resume) or action.arm == ALL_ARMS or action.arm in self.roster
+        if ours and requested_job(operation.request) not in self.book.past and self.book.operations.is_new(operation):
+            self.book.record(Requested(operation))
 
     def add_faults(self, job: str, faults: Faults) -> None:
         """Record faults in a job that a peer knows.
@@ -186,186 +158,96 @@ class Granter:
         Raises:
             JournalError: they are not on disk, and nothing has changed.
         """
-        if not self.register.knows(job, faults):
-            self._record([Faulted(job, faults)])
+        entry = self.book.jobs.get(job)
+        if faults and not (entry is not None and faults.keys() <= entry.faults.keys()):
+            self.book.record(Faulted(job, faults))
 
-    def add_jobs(self, jobs: tuple[JobSpec, ...], by: str = "") -> None:
-        """Add submitted jobs.
+    def add_jobs(self, jobs: Iterable[JobSpec], by: str = "") -> None:
+        """Add jobs that this arm does not know.
 
         Raises:
             JournalError: none is on disk.
         """
-        register = self.register
-        new = tuple(job for job in jobs if job.name not in register.jobs and job.name not in register.past)
-        new = new[: max(0, MAX_OPEN_JOBS + MAX_SETTLED - len(register.jobs))]
-        self._record([JobsAccepted(new, by)] if new else [])
+        book = self.book
+        new = tuple(job for job in jobs if not book.is_known(job.name))
+        new = new[: max(0, MAX_OPEN_JOBS + MAX_SETTLED - len(book.jobs))]
+        if new:
+            self.book.record(JobsAccepted(new, by, book.time_s))
 
-    def adopt(self, records: list[GrantRecord], real_s: float) -> None:
+    def adopt(self, records: list[BookRecord], real_s: float) -> None:
         """Record what other arms have done and have; what they have counts as leased from now.
 
         Raises:
             JournalError: nothing is on disk.
         """
-        self._record(records)
-        for record in records:
-            if isinstance(record, JobGranted):
-                self.register.grants[record.job].until_s = real_s + self._timing.counted_lease_s
-
-    def begin_epoch(self, epoch: str) -> None:
-        """Record the name of the shift.
-
-        Raises:
-            JournalError: it is not on disk.
-        """
-        self._record([EpochBegun(epoch)])
-
-    def is_granted(self, job: str, real_s: float) -> bool:
-        """Return whether an arm has a job, or may have it."""
-        grant = self.register.grants.get(job)
-        return grant is not None and (grant.may_commit or real_s < grant.until_s)
-
-    def busy_stations(self, real_s: float) -> frozenset[str]:
-        """Return the stations at which an arm may be at work."""
-        leased = (grant for grant in self.register.grants.values() if real_s < grant.until_s)
-        return frozenset(place for grant in leased for place in grant.places)
-
-    def out_of_contact(self, real_s: float) -> frozenset[str]:
-        """Return the jobs whose arm got permission to commit and has not renewed its lease since."""
-        grants = self.register.grants.items()
-        return frozenset(job for job, grant in grants if grant.may_commit and real_s >= grant.until_s)
-
-    def status(self, job: str, real_s: float) -> JobStatus:
-        """Return the status of a job, as far as this arm knows from its grants and from received outcomes."""
-        outcome, grant = self.register.settled.get(job), self.register.grants.get(job)
-        cycles, last = self.register.cycles.get(job, 0), self.register.last_arm.get(job, "")
-        if outcome is not None and outcome.outcome == "finished":
-            return JobStatus(job, "finished", outcome.arm, outcome.award, cycles, outcome.time_s, outcome.reason)
-        if outcome is not None and (outcome.outcome == "given_up" or outcome.outcome == "cancelled"):
-            return JobStatus(job, outcome.outcome, last, cycles=cycles, reason=outcome.reason)
-        if outcome is not None:
-            return JobStatus(job, "unfinished", outcome.arm, outcome.award, cycles, None, outcome.reason)
-        if grant is None or not self.is_granted(job, real_s):
-            return JobStatus(job, "waiting", last, cycles=cycles, reason=self._why_again(job, last))
-        if grant.may_commit and real_s >= grant.until_s:
-            return JobStatus(job, "unfinished", grant.arm, grant.award, cycles, None, reason_for_silence(grant.arm))
-        cancel = self.register.operations.cancelled(job)
-        reason = "" if cancel is None else f"{_cancelled_by(cancel)[:-1]}; its arm ends the cycle in progress."
-        state = "finishing" if grant.may_commit else "awarded"
-        return JobStatus(job, state, grant.arm, grant.award, cycles, None, reason)
+        self.book.record(*records)
+        for award in self.book.open.keys() - self.book.leases.keys():
+            self.book.leases[award] = CountedLease(real_s + self.timing.counted_lease_s)
 
     # Inside
 
-    def _why_again(self, job: str, arm: str) -> str:
-        """Return the request of a person by which a job waits again; "" if there is none."""
-        operations = self.register.operations
-        if arm and (pauser := operations.paused.get(arm)) is not None:
-            return f"Its arm was paused by '{pauser}'."
-        redo = operations.latest.get(("redo", job))
-        return "" if redo is None else f"To be redone, by '{redo.request.by}'."
-
-    def _is_new(self, outcome: JobOutcome) -> bool:
-        if outcome.outcome == "returned":
-            more = outcome.cycles > self.register.cycles.get(outcome.job, 0)
-            return more or not self.register.knows(outcome.job, outcome.faults)
-        return self.register.is_news(outcome)
-
-    def _given_up(self, real_s: float) -> list[GrantRecord]:
-        """Outcomes of jobs that no arm has, and in which arms have faulted too often."""
-        register = self.register
-        outcomes: list[GrantRecord] = []
-        for job, faults in register.faults.items():
-            reason = reason_to_give_up(faults.values())
-            if reason and job not in register.settled and not self.is_granted(job, real_s):
-                award, cycles = max(faults), register.cycles.get(job, 0)
-                outcome = JobOutcome(job, award, faults[award], "given_up", cycles, register.time_s, reason)
-                outcomes.append(JobSettled(outcome))
-        return outcomes
-
-    def _cancelled(self, real_s: float) -> list[GrantRecord]:
-        """Outcomes of cancelled jobs that no arm has."""
-        register = self.register
-        outcomes: list[GrantRecord] = []
-        for job, operation in register.operations.all_cancelled.items():
-            known = register.settled.get(job)
-            if (known is None or known.outcome == "given_up") and not self.is_granted(job, real_s):
-                award, arm, cycles = operation.request.request, operation.auctioneer, register.cycles.get(job, 0)
-                reason = _cancelled_by(operation)
-                outcomes.append(JobSettled(JobOutcome(job, award, arm, "cancelled", cycles, operation.time_s, reason)))
-        return outcomes
-
-    def _released(self, claim: Claim) -> list[GrantRecord]:
-        kept = {entry.award for entry in claim.entries}
-        return [
-            Released(grant.award, job, claim.arm, claim.number)
-            for job, grant in self.register.grants.items()
-            if grant.arm == claim.arm and grant.award not in kept
-        ]
-
     def _set_space(self, claim: Claim) -> None:
         """Record which space an arm takes by its claim, without that of its entries that is not granted yet."""
-        before = self.register.space[claim.arm]
+        before = self.book.space[claim.arm]
         stated = frozenset([ANYWHERE] if claim.space is None else claim.space)
         after = before & {entry.space or ANYWHERE for entry in claim.entries} | stated
         if after != before:
-            self._record([SpaceTaken(claim.arm, tuple(sorted(after)), number=claim.number)])
+            self._record(claim, SpaceTaken(claim.arm, tuple(sorted(after))))
 
     def _objection(self, arm: str, entry: ClaimEntry, real_s: float) -> str:
         """Return why a job cannot be granted now, or ""."""
-        if self.register.is_settled(entry.job):
+        book, job = self.book, self.book.jobs.get(entry.job, JobEntry(entry.job))
+        grant, before = job.grant, job.grants.get(entry.award)
+        same = grant is not None and (grant.record.arm, grant.record.award) == (arm, entry.award)
+        if book.is_settled(entry.job):
             return f"'{entry.job}' is settled"
-        if entry.award in self.register.operations.redone(entry.job):
+        if entry.award in book.operations.redone(entry.job):
             return f"a person has '{entry.job}' done again"
-        grant = self.register.grants.get(entry.job)
-        same = grant is not None and (grant.arm, grant.award) == (arm, entry.award)
-        if grant is not None and same and grant.revoked:
+        if before is not None and before.revoked:
             return f"the space of '{arm}' was cleared"
-        cancel = self.register.operations.cancelled(entry.job)
+        if (job.aside or entry.job in book.aside) and not same:
+            return f"'{entry.job}' is quarantined"
+        cancel = book.operations.cancelled(entry.job)
         if cancel is not None and not (grant is not None and same and grant.may_commit):
-            if grant is not None and same:  # its arm ends the cycle in progress, which may take longer than a lease
-                grant.until_s = real_s + self._timing.counted_lease_s
-            return _cancelled_by(cancel)
-        has_space = same and (entry.space or ANYWHERE) in self.register.space[arm]
-        if not has_space and (in_way := self.in_the_way(arm, entry.space)):
+            if same:  # its arm ends the cycle in progress, which may take longer than a lease
+                book.leases[entry.award].until_s = real_s + self.timing.counted_lease_s
+            return cancelled_by(cancel)
+        space = entry.space or ANYWHERE
+        if not (before is not None and space in book.taken_space()[arm]) and (in_way := self.in_the_way(arm, space)):
             return f"'{in_way[0]}' is in the way"
-        if grant is not None and self.is_granted(entry.job, real_s):
-            return "" if same else f"'{grant.arm}' has '{entry.job}'"
-        for job, other in self.register.grants.items():
-            if job != entry.job and real_s < other.until_s and set(other.places) & set(entry.places):
-                return f"'{other.arm}' is at the same station with '{job}'"
-        return ""
+        if grant is not None:
+            return "" if same else f"'{grant.record.arm}' has '{entry.job}'"
+        for other in book.open.values():
+            if not other.silent and set(other.record.places) & set(entry.places):
+                return f"'{other.record.arm}' is at the same station with '{other.record.job}'"
+        return "the shift is over" if book.ended else ""
 
     def _grant(self, claim: Claim, entry: ClaimEntry, real_s: float) -> str:
         """Grant a job, or extend its grant; return why it could not be written to disk, or ""."""
-        done = self.register.cycles.get(entry.job, 0)
-        cycles = max(entry.cycles, done)
-        grant = self.register.grants.get(entry.job)
-        permitted = grant.may_commit if grant is not None and grant.award == entry.award else None
-        may_commit = entry.phase == "finishing" or bool(permitted)
-        records: list[GrantRecord] = []
-        if permitted != may_commit or cycles > done:
-            records.append(
-                JobGranted(claim.arm, claim.number, entry.award, entry.job, entry.places, cycles, may_commit)
-            )
-        taken, space = self.register.space[claim.arm], entry.space or ANYWHERE
-        if space not in taken:
-            records.append(SpaceTaken(claim.arm, tuple(sorted(taken | {space})), number=claim.number))
+        book, job = self.book, self.book.jobs.get(entry.job)
+        grant, asks = None if job is None else job.grant, entry.phase == "finishing"
+        records: list[BookRecord] = []
+        space = entry.space or ANYWHERE
+        if job is None or grant is None:
+            terms = (entry.award, entry.job, claim.arm, book.time_s, entry.cycles, entry.places, space, asks)
+            records.append(Granted(*terms))
+        else:
+            records += renewal(book, entry.award, book.time_s, entry.cycles, finishing=asks)
+            if entry.cycles > job.cycles:
+                records.append(Progress(entry.job, entry.cycles))
+            if space not in book.taken_space()[claim.arm]:
+                records.append(SpaceTaken(claim.arm, tuple(sorted(book.space[claim.arm] | {space}))))
         try:
-            self._record(records)
+            self._record(claim, *records)
         except JournalFull as error:
             return str(error)
-        self.register.grants[entry.job].until_s = real_s + self._timing.counted_lease_s
+        book.leases.setdefault(entry.award, CountedLease(0.0)).until_s = real_s + self.timing.counted_lease_s
         return ""
 
-    def _record(self, records: list[GrantRecord]) -> None:
-        """Write records, then apply them."""
+    def _record(self, claim: Claim, *records: BookRecord) -> None:
+        """Write what follows from a claim, with its number."""
         if records:
-            self._keep(*records)
-        for record in records:
-            self.register.apply(record)
-
-
-def _cancelled_by(operation: Operation) -> str:
-    return f"Cancelled by '{operation.request.by}'."
+            self.book.record(ClaimNumbered(claim.arm, claim.number), *records)
 
 
 _LOG = logging.getLogger(__name__)
@@ -488,14 +370,12 @@ class Claimant:
         self._operations[operation.request.request] = operation
         self._due = True
 
-    def revoke(self, is_stopped: Callable[[str], bool], real_s: float) -> None:
+    def revoke(self, is_stopped: Callable[[str], bool]) -> None:
         """Withdraw requests for jobs, and have the arm return those whose last cycle is not permitted."""
         for award, pending in list(self.pending.items()):
             if is_stopped(pending.job.name):
                 self._reject(award)
-        going_on = (active for active in self.executor.active if not (active.may_commit or active.revoked))
-        if awards := tuple(active.award.award for active in going_on if is_stopped(active.job)):
-            self.executor.apply_lease(Lease(self.arm, self._timing.lease_s, (), awards), real_s)
+        self.executor.revoke(REVOKED, is_stopped)
 
     def claim_soon(self) -> None:
         """Claim with the next tick: a lease, a permission to commit or a receipt is due."""
@@ -582,8 +462,8 @@ class Claimant:
         outcomes: list[JobOutcome] = []
         for report, on_disk in self.executor.pending_reports():
             if on_disk:
-                faults = self.granter.register.faults.get(report.job, {})
-                outcomes.append(_outcome_of(report, faults | ({report.award: self.arm} if report.faulted else {})))
+                faults = self._faults(report.job) | ({report.award: self.arm} if report.faulted else {})
+                outcomes.append(outcome_of(report, faults))
                 self._receipts.setdefault(report.award, set())
             elif last := self._last_entries.get(report.award):
                 phase = "finishing" if last.phase == "finishing" else "working"
@@ -595,7 +475,7 @@ class Claimant:
         """Act on the replies of a majority."""
         for award, pending in list(self.pending.items()):
             vote = self._votes[award]
-            if reason_to_give_up(self.granter.register.faults.get(pending.job.name, {}).values()):
+            if reason_to_give_up(self._faults(pending.job.name).values()):
                 self._reject(award)
             elif len(vote.granted_s) >= self.majority:
                 self._accept(award, pending, vote, real_s)
@@ -651,6 +531,11 @@ class Claimant:
         if reports - self._receipts.keys():
             self._change()
 
+    def _faults(self, job: str) -> Faults:
+        """Return the known faults in a job."""
+        entry = self.granter.book.jobs.get(job)
+        return {} if entry is None else entry.faults
+
     def _add_faults(self, job: str, faults: Faults) -> None:
         try:
             self.granter.add_faults(job, faults)
@@ -662,10 +547,3 @@ class Claimant:
             self.granter.apply_outcome(outcome)
         except JournalError as error:
             _LOG.error("Could not persist outcome of '%s': %s", outcome.job, error)
-
-
-def _outcome_of(report: Report, faults: Faults) -> JobOutcome:
-    """Return a report as a job outcome for peers; one that leaves the job open names all known faults in it."""
-    outcome = "finished" if report.outcome == "finished" else "unfinished" if report.unsure else "returned"
-    named = faults if outcome == "returned" else {}
-    return JobOutcome(report.job, report.award, report.arm, outcome, report.cycles, report.time_s, report.reason, named)

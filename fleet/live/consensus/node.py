@@ -1,9 +1,4 @@
-"""Epochs without an auctioneer: an arm whose journals are lost has forgotten what it granted and what was done.
-
-It does not take part beside arms that know it, unless a person requests it (`--new-epoch`). Then it adopts what the
-present arms have done and have, as an auctioneer does (`fleet.live.auction.node`).
-
-An arm without an auctioneer, on the bus: it exchanges bids and claims with its peers and keeps the fleet's time.
+"""An arm without an auctioneer, on the bus: it exchanges bids and claims with its peers and keeps the fleet's time.
 
 The fleet's time is the latest that any arm keeps: an arm that receives a later one sets its clock to it. It begins when
 all arms of the roster are present, or a majority has waited long enough for the others.
@@ -14,121 +9,26 @@ import math
 import secrets
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping
-from itertools import chain
 from random import Random
 
 from msgspec.structs import replace
 
 from fleet.bus.client import AnotherReplies, Replies
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import (
-    ABANDONED,
-    MOST_JOBS,
-    Clock,
-    ClockRequest,
-    JobSpec,
-    JobStatus,
-    LeaseRequest,
-    Report,
-    Status,
-    StatusRequest,
-    Submission,
-    SubmissionReply,
-)
-from fleet.bus.protocol.cell import Cell, CellRequest
-from fleet.bus.protocol.consensus import MOST_FINISHED, Bid, Claim, ClaimReply, History, HistoryRequest, JobOutcome
-from fleet.bus.protocol.messages import State, encode
+from fleet.bus.protocol.auction import JobStatus, LeaseRequest, Report, Submission, SubmissionReply
+from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply, History, HistoryRequest
+from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
-from fleet.errors import BusError, Refused
-from fleet.live.arm.awards import MAX_BYTES
+from fleet.errors import BusError, JournalFull, Refused
 from fleet.live.arm.node import ArmNode, RateLimitedWarnings
-from fleet.live.auction.job_rules import admit, status_reply
-from fleet.live.auction.node import REPLY_S, ask_arms, describe
+from fleet.live.book import JobBook
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Granter
-from fleet.live.consensus.jobs import GrantRecord, JobGranted, JobSettled, Register
 from fleet.live.consensus.participant import QUIET_S, Membership, Participant
+from fleet.live.desk import JobDesk
+from fleet.live.epochs import REPLY_S, adopted, ask_arms, check_journals, history_of
 from fleet.live.journal import EpochBegun, Journal, Started, TimeRecorder, own_records
-
-REMEDY = (
-    "Jobs could be done twice. Stop this arm and bring its journals back, or start it with --new-epoch: then it adopts "
-    "what the present arms have done and have; what only absent arms know is lost."
-)
-
-
-def first_number(arm: str, boot: int, register: Register) -> int:
-    """Return the number after which the claims and bids of a start of an arm are counted."""
-    return max(boot, register.numbers.get(arm, -1) // NUMBERS_PER_BOOT + 1) * NUMBERS_PER_BOOT
-
-
-def check_journals(arm: str, number: int, epoch: str, histories: Iterable[History], *, new_epoch: bool = False) -> None:
-    """Check that the journals of an arm are those that its peers know.
-
-    Args:
-        number: As `first_number` returns it.
-        new_epoch: Whether a person has requested that the arm begins without the journals that its peers know.
-
-    Raises:
-        BusError: they are lost, older copies, or of another epoch: jobs might be done twice.
-    """
-    for peer in (history for history in histories if history.arm != arm):
-        claimed = peer.claims.get(arm, -1)
-        if "" not in (epoch, peer.epoch) and epoch != peer.epoch:
-            raise BusError(
-                f"The journals of '{arm}' are of the epoch '{epoch}', but {describe(peer)}. Jobs could be done twice. "
-                "Bring the right journals back, or put these aside and start the arm with --new-epoch."
-            )
-        lost = claimed >= number or (claimed >= 0 and peer.epoch and not epoch)
-        if lost and not new_epoch:
-            raise BusError(
-                f"'{peer.arm}' knows claims of '{arm}' that its journals do not: they are lost, or older copies; "
-                f"{describe(peer)}. {REMEDY}"
-            )
-
-
-def adopted(arm: str, register: Register, histories: Iterable[History]) -> list[GrantRecord]:
-    """Return the records of what other arms have done and have, as far as a register does not know it."""
-    records: list[GrantRecord] = []
-    for peer in (history for history in histories if history.arm != arm):
-        if peer.epoch and not register.epoch and not any(isinstance(each, EpochBegun) for each in records):
-            records.append(EpochBegun(peer.epoch))
-        for job in peer.finished:
-            outcome = JobOutcome(job.name, "?", peer.arm, "finished", job.repetitions, 0.0)
-            if not register.is_settled(job.name):
-                records.append(JobSettled(outcome))
-        for outcome in peer.committed:
-            if outcome.job in register.grants or register.is_settled(outcome.job):
-                continue
-            if outcome.arm == arm:  # it may have done the last cycle, and does not know
-                records.append(JobSettled(outcome))
-            else:
-                number = peer.claims.get(outcome.arm, 0)
-                records.append(
-                    JobGranted(outcome.arm, number, outcome.award, outcome.job, (outcome.job,), outcome.cycles, True)
-                )
-    return records
-
-
-def history_of(arm: str, register: Register, jobs: Mapping[str, JobSpec]) -> History:
-    """Return what an arm knows to be done, and to whom it has given permission to commit, as much as one message holds.
-
-    Args:
-        jobs: Jobs that the arm knows, by name.
-    """
-    reason = f"The journals of its arm were lost; '{arm}' had granted it permission to commit."
-    committed = tuple(
-        JobOutcome(job, grant.award, grant.arm, "unfinished", register.cycles.get(job, 0), register.time_s, reason)
-        for job, grant in register.grants.items()
-        if grant.may_commit
-    )[:MOST_JOBS]
-    history = History(arm, register.epoch, (), claims=dict(register.numbers), committed=committed)
-    size, finished = len(encode(history)), list[JobSpec]()
-    for job in [job for name, job in jobs.items() if register.is_finished(name)][-MOST_FINISHED:]:
-        if (size := size + len(encode(job)) + 1) <= MAX_BYTES:
-            finished.append(job)
-    return replace(history, finished=tuple(finished))
-
+from fleet.live.records import BookRecord
 
 _LOG = logging.getLogger(__name__)
 
@@ -142,7 +42,12 @@ NOT_YET_S = 1e9
 """Real seconds until the fleet's time would begin if no arm started it: never."""
 
 
-class ConsensusNode:
+def first_number(arm: str, boot: int, book: JobBook) -> int:
+    """Return the number after which the claims and bids of a start of an arm are counted."""
+    return max(boot, book.numbers.get(arm, -1) // NUMBERS_PER_BOOT + 1) * NUMBERS_PER_BOOT
+
+
+class ConsensusNode(JobDesk):
     """Work source of an arm that allocates jobs together with its peers.
 
     Attributes:
@@ -156,7 +61,7 @@ class ConsensusNode:
         self,
         arm: ArmNode,
         membership: Membership,
-        journal: Journal[GrantRecord],
+        journal: Journal[BookRecord],
         *,
         boot: int,
         new_epoch: bool = False,
@@ -171,18 +76,19 @@ class ConsensusNode:
             BusError: peers know another epoch, or claims of this arm after those in its journals.
             JournalError: the journal is of another arm.
         """
+        super().__init__(arm.executor.arm, arm.clock.speed, membership.cell)
         self._arm, self._link, self._membership = arm, arm.link, membership
-        self._name, self._speed = arm.executor.arm, arm.clock.speed
-        register = Register().replay(chain(own_records(journal, self._name), [Started(self._name)]))
+        book = JobBook(membership.places, name=self._name, is_central=False)
+        self.book = book.replay(own_records(journal, self._name), journal.quarantine)
+        book.apply(Started(self._name))
         real_s = time.monotonic()
-        self._recorder = TimeRecorder(journal, register, real_s)
+        self._recorder = TimeRecorder(journal, book, real_s)
         roster = membership.fleet.arms
         timing, excludes = membership.timing, membership.excludes
-        granter = Granter(self._name, roster, register, journal.append, real_s=real_s, timing=timing, excludes=excludes)
-        self._first_number, self._new_epoch = first_number(self._name, boot, register), new_epoch
+        granter = Granter(self._name, roster, book, journal.append, real_s=real_s, timing=timing, excludes=excludes)
+        self._first_number, self._new_epoch = first_number(self._name, boot, book), new_epoch
         boot = self._first_number // NUMBERS_PER_BOOT
         self.participant = Participant(arm, granter, membership, boot=boot, rng=Random(f"{self._name} {boot}"))
-        self.participant.add_jobs(register.jobs.values())
         self._stream = deque(membership.stream)
         self._warn = RateLimitedWarnings(self._name)
         self._tokens: set[str] = set()
@@ -231,9 +137,9 @@ class ConsensusNode:
         real_s = time.monotonic()
         if math.isinf(self._membership.horizon_s):
             return False
-        if self.participant.known.ended:
+        if self.book.ended:
             own = self.participant.executor.active or self.participant.executor.has_pending_reports
-            others = any(status.state == "finishing" for status in self.statuses())
+            others = any(grant.may_commit and not grant.silent for grant in self.book.open.values())
             return not (own or others) or real_s >= self._ended_s + LAST_S
         return self._begun and not self._stream and self.participant.all_settled(real_s)
 
@@ -254,7 +160,8 @@ class ConsensusNode:
         known = max((history.claims.get(self._name, -1) for history in histories), default=-1)
         if known >= number or (known >= 0 and not self._epoch):
             _LOG.warning("Arm '%s' adopts what %d arm(s) have done and have.", self._name, len(histories))
-            granter.adopt(adopted(self._name, granter.register, histories), time.monotonic())
+            for history in (each for each in histories if each.arm != self._name):
+                granter.adopt(adopted(self.book, history), time.monotonic())
             self.participant.count_after(known)
 
     def _ask_peers(self, real_s: float) -> None:
@@ -283,9 +190,8 @@ class ConsensusNode:
         if not self._begun:
             self._begin(real_s)
         if self._begun:
-            while self._stream and self._stream[0][0] <= time_s:
-                self.participant.add_jobs([self._stream.popleft()[1]])
-            if time_s >= self._membership.horizon_s and not self.participant.known.ended:
+            self._offer_jobs(time_s)
+            if time_s >= self._membership.horizon_s and math.isinf(self._ended_s):
                 self._end(real_s, time_s)
             self.participant.set_present(frozenset(self._tokens))
             self.participant.tick(real_s, time_s)
@@ -293,6 +199,16 @@ class ConsensusNode:
             self._recorder.step(real_s, time_s)
         quiet_s = self.participant.changed_s + QUIET_S
         self.wake_s = quiet_s if quiet_s > real_s else math.inf
+
+    def _offer_jobs(self, time_s: float) -> None:
+        """Add the jobs of the stream that are due, as many as the disk has space for."""
+        due = [job for at_s, job in self._stream if at_s <= time_s]
+        try:
+            self.participant.granter.add_jobs(due)
+        except JournalFull as error:
+            self._warn("jobs", f"cannot record jobs that are due: {error}")
+        while self._stream and self.book.is_known(self._stream[0][1].name):
+            self._stream.popleft()
 
     def _begin(self, real_s: float) -> None:
         """Start the fleet's time, unless a peer has started it."""
@@ -312,8 +228,9 @@ class ConsensusNode:
 
     def _end(self, real_s: float, time_s: float) -> None:
         """End the shift; only a last cycle continues."""
-        self.participant.known.ended, self._ended_s = True, real_s
-        executor = self.participant.executor
+        if not self.participant.end():
+            return
+        self._ended_s, executor = real_s, self.participant.executor
         if executor.active and not executor.active[0].may_commit:
             executor.return_all(time_s, real_s, "the shift is over")
 
@@ -326,12 +243,7 @@ class ConsensusNode:
         self._publish_bid = link.publisher(keys.of_arm(fleet, name, "bid"), Bid)
         self._publish_operation = link.publisher(keys.of_arm(fleet, name, "operation"), Operation)
         link.reply_to(keys.asked_by_every_arm(fleet, name, "claim"), Claim, self._answer_claim)
-        link.reply_to(keys.of_jobs(fleet, "submit"), Submission, self._submit)
-        link.reply_to(keys.of_jobs(fleet, "status"), StatusRequest, self._status)
-        link.reply_to(keys.of_jobs(fleet, "clear"), ClearRequest, self._clear)
-        link.reply_to(keys.of_jobs(fleet, "control"), ControlRequest, self._control)
-        link.reply_to(keys.of_jobs(fleet, "cell"), CellRequest, self._describe_cell)
-        link.reply_to(keys.of_clock(fleet), ClockRequest, self._clock)
+        self._declare_desk(link)
         link.subscribe(keys.of_every_arm(fleet, "bid"), Bid, self._apply_bid, history=True)
         link.subscribe(keys.of_every_arm(fleet, "state"), State, self.participant.apply_state)
         link.watch_tokens(keys.of_every_arm(fleet, "alive"), self._apply_token)
@@ -351,13 +263,13 @@ class ConsensusNode:
 
     @property
     def _epoch(self) -> str:
-        return self.participant.granter.register.epoch
+        return self.book.epoch
 
     def _take_epoch(self, epoch: str) -> bool:
         """Take the epoch of the fleet, unless there is one on disk already; return whether it is this one."""
         if epoch and not self._epoch:
             try:
-                self.participant.granter.begin_epoch(epoch)
+                self.book.record(EpochBegun(epoch))
             except Refused as error:
                 self._warn("epoch", f"cannot record the epoch: {error}")
         elif epoch not in ("", self._epoch):
@@ -365,7 +277,7 @@ class ConsensusNode:
         return epoch in ("", self._epoch)
 
     def _history(self, _: HistoryRequest) -> History:
-        return history_of(self._name, self.participant.granter.register, self.participant.known.submitted)
+        return history_of(self._name, self.book)
 
     def _apply_token(self, arm: str, present: bool) -> None:
         (self._tokens.add if present else self._tokens.discard)(arm)
@@ -373,7 +285,7 @@ class ConsensusNode:
     def _answer_claim(self, claim: Claim) -> ClaimReply:
         if claim.arm == self._name or not self._begun:
             raise AnotherReplies
-        return self.participant.answer_claim(claim, time.monotonic())
+        return self.participant.granter.answer_claim(claim, time.monotonic())
 
     # Requests of others: all arms receive them, and the first present one replies
 
@@ -386,55 +298,33 @@ class ConsensusNode:
         if not self._begun or self._name != min(self._tokens & self.participant.granter.roster, default=self._name):
             raise AnotherReplies
 
+    @property
+    def time_s(self) -> float:
+        """Fleet time."""
+        return self._arm.clock.now_s(time.monotonic())
+
+    def _statuses(self, names: tuple[str, ...]) -> list[JobStatus]:
+        return [status for status in self.statuses() if not names or status.job in names]
+
     def _submit(self, submission: Submission) -> SubmissionReply:
-        known = {job.name: job for _, job in self._stream} | self.participant.known.submitted
-        ended = self.participant.known.ended
-        past = self.participant.granter.register.past
-        given_up = {status.job for status in self.statuses() if status.state in ABANDONED}
-        given_up |= {name for job in submission.jobs for name in job.after if past.is_given_up(name)}
-        count, places = len(self.participant.open_jobs(time.monotonic())), self._membership.places
-        admissions = admit(
-            submission.jobs, known, places=places, count=count, ended=ended, given_up=given_up, past=past
-        )
-        accepted = tuple(job for job, reply in zip(submission.jobs, admissions, strict=True) if reply.accepted)
-        self.participant.granter.add_jobs(tuple(job for job in accepted if job.name not in known), submission.by)
-        self.participant.add_jobs(accepted)
+        later = {job.name: job for _, job in self._stream}
+        admissions = self.book.admit(submission.jobs, later)
+        accepted = [job for job, reply in zip(submission.jobs, admissions, strict=True) if reply.accepted]
+        self.participant.granter.add_jobs(accepted, submission.by)
         self._check_first()
         return SubmissionReply(self._name, admissions, self._epoch)
 
-    def _status(self, request: StatusRequest) -> Status:
-        self._check_first()
-        statuses = [status for status in self.statuses() if not request.jobs or status.job in request.jobs]
-        time_s, register = self._arm.clock.now_s(time.monotonic()), self.participant.granter.register
-        paused = register.operations.paused
-        return status_reply(self._name, time_s, statuses, register.space, self._epoch, paused)
-
     def _clear(self, request: ClearRequest) -> Cleared:
-        real_s = time.monotonic()
-        present = frozenset(self._tokens) | {self._name}
+        present = frozenset(self._tokens | {self._name})
         try:
-            self.participant.granter.clear(request.arm, request.by, present, real_s, self._arm.clock.now_s(real_s))
+            self.participant.granter.clear(request.arm, request.by, present, time.monotonic(), self.time_s)
         finally:
             self._check_first()
         return Cleared(self._name, request.arm)
 
     def _control(self, request: ControlRequest) -> Controlled:
         self._check_first()
-        real_s = time.monotonic()
-        later = (job for _, job in self._stream)
-        reply = self.participant.control(request, real_s, self._arm.clock.now_s(real_s), later)
-        _LOG.warning("'%s' requested: %s", request.by, request.action)
-        return reply
-
-    def _describe_cell(self, _: CellRequest) -> Cell:
-        self._check_first()
-        if self._membership.cell is None:
-            raise Refused("This arm knows no cell.")
-        return self._membership.cell
-
-    def _clock(self, _: ClockRequest) -> Clock:
-        self._check_first()
-        return Clock(self._arm.clock.now_s(time.monotonic()), self._speed, self._epoch)
+        return self.participant.control(request, self.time_s, (job for _, job in self._stream))
 
     # Messages to send
 

@@ -26,9 +26,9 @@ from fleet.bus.protocol.consensus import History, HistoryRequest
 from fleet.bus.protocol.messages import State
 from fleet.bus.router import Router
 from fleet.live.auction.node import AuctionNode
-from fleet.live.auction.records import AuctionRecord, salvage
 from fleet.live.auction.rounds import Assignment
 from fleet.live.journal import Journal, quarantine
+from fleet.live.records import BookRecord, salvage
 from tests.waiting import PATIENCE_S
 
 
@@ -120,7 +120,7 @@ class Bus:
             link = resources.enter_context(BusClient(self.endpoint, "f"))
             path = self.folder / folder / name
             extra["quarantine"] = salvage(quarantine(path.with_suffix(".aside"), name))
-            journal = resources.enter_context(Journal[AuctionRecord](path, AuctionRecord, **extra))
+            journal = resources.enter_context(Journal[BookRecord](path, BookRecord, **extra))
             node = AuctionNode(link, name, journal, **{"allocate": first_come, "speed": 60.0, **options})
             node.resources = self.stack.enter_context(resources.pop_all())
         self.nodes.append(node)

@@ -29,12 +29,12 @@ from fleet.bus.router import open_client, other_versions
 from fleet.errors import BusError, JournalFull, Refused
 from fleet.live import journal
 from fleet.live.auction import node as auction_node
-from fleet.live.auction.job_rules import status_reply
+from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.knowledge import LiveFleet
-from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.node import AuctionNode
-from fleet.live.auction.records import Operated
-from fleet.live.auction.rounds import LedgerWriter
+from fleet.live.book import JobBook
+from fleet.live.doubts import replay
+from fleet.live.job_rules import status_reply
 from fleet.live.journal import EpochBegun, JobsAccepted, Journal
 from fleet.live.monitor.snapshot import FleetListener
 from fleet.live.policy_client import PolicyClient
@@ -104,7 +104,7 @@ def test_the_journal_is_compacted_at_the_start_and_when_it_has_grown(bus, monkey
     bus.until(lambda: bus.states(first) == ["finished"])
     bus.kill(first)
     again = bus.auctioneer()
-    assert [type(record).__name__ for record in again.journal.records()] == ["LedgerSnapshot", *TWICE]
+    assert [type(record).__name__ for record in again.journal.records()] == ["BookSnapshot", *TWICE]
     assert bus.states(again) == ["finished"]
     monkeypatch.setattr(journal, "TICK_S", 0.01)
     monkeypatch.setattr(journal, "COMPACT_BYTES", 1)
@@ -126,7 +126,7 @@ def test_a_journal_that_cannot_be_compacted_is_continued(bus, monkeypatch, caplo
         again = bus.auctioneer()
     assert "is not compacted: no room" in caplog.text
     assert [type(record).__name__ for record in again.journal.records()] == [
-        "LedgerSnapshot",
+        "BookSnapshot",
         *TWICE,
         "EpochBegun",
         "JobsAccepted",
@@ -170,11 +170,11 @@ def test_a_state_without_a_token_takes_no_space_unless_the_arm_is_of_the_cell(bu
     for _ in range(3):
         outsider.publish(keys.of_arm("f", "nobody", "state"), said)
         bus.serve_for(0.1)
-    assert "nobody" not in node.auctioneer.ledger.taken_space()
+    assert "nobody" not in node.auctioneer.book.taken_space()
     outsider.declare_token(keys.of_arm("f", "nobody", "alive"))
     bus.until(lambda: "nobody" in node._tokens)
     outsider.publish(keys.of_arm("f", "nobody", "state"), said)
-    bus.until(lambda: "nobody" in node.auctioneer.ledger.taken_space())
+    bus.until(lambda: "nobody" in node.auctioneer.book.taken_space())
 
 
 def test_an_auctioneer_with_a_poisonous_job_goes_on_reports_it_and_has_it_settled(bus):
@@ -218,19 +218,20 @@ def test_every_action_travels_as_json(action):
     assert decode(ControlRequest, encode(request)) == request
 
 
-def writer(ledger: Ledger) -> LedgerWriter:
-    return LedgerWriter("boss", ledger, lambda *records: None, 0.0)
+def auctioneer_of(book: JobBook) -> Auctioneer:
+    return Auctioneer("boss", book, allocate=lambda _: {}, keep=lambda *_: None, boot="1", real_s=0.0)
 
 
 def test_a_restart_publishes_as_much_again_as_was_cached():
     """Or what a recorder had not yet received when the auctioneer ended is lost."""
-    ledger = Ledger().replay([EpochBegun("e")])
-    before = writer(ledger)
+    before = auctioneer_of(replay(JobBook(), [EpochBegun("e")]))
     for start in range(0, 2 * HISTORY, 128):
         jobs = tuple(JobSpec(name=str(start + i), kind="hold", places=("rack",)) for i in range(128))
-        before.record(JobsAccepted(jobs, "bob", 1.0))
-    before.record(*(Operated(ControlRequest(str(number), Pause("arm_0"), "ann"), 2.0) for number in range(3)))
-    after = writer(Ledger().replay(ledger.compact()))
+        before.book.record(JobsAccepted(jobs, "bob", 1.0))
+    before.set_present(frozenset(["arm_0"]))
+    for number in range(3):
+        before.control(ControlRequest(str(number), Pause("arm_0"), "ann"), 2.0)
+    after = auctioneer_of(replay(JobBook(), before.book.compact()))
     for kind in (Result, Operation):
         sent, again = ([message for message in each.out if isinstance(message, kind)] for each in (before, after))
         assert [message.number for message in sent] == list(range(len(sent)))
@@ -258,11 +259,11 @@ def test_an_empty_journal_is_refused_beside_arms_that_know_an_epoch(bus):
     with pytest.raises(BusError, match=r"'arm_0' knows the epoch '\w+', 2 finished job\(s\), the last ones a, b"):
         served(bus, bus.auctioneer)
     again = served(bus, lambda: bus.auctioneer(new_epoch=True))
-    bus.until(lambda: again.present and len(again.auctioneer.ledger.past) == 2)
+    bus.until(lambda: again.present and len(again.book.jobs) == 2)
     after = submit(bus, "a", "b", "c")
     assert [job.accepted for job in after.jobs] == [True] * 3
     assert before.epoch != after.epoch == again.epoch
-    bus.until(lambda: bus.states(again) == ["finished"])
+    bus.until(lambda: bus.states(again) == ["finished"] * 3)
     assert arm.done == ["a", "b", "c"]
     replies = (
         *bus.ask(keys.of_clock("f"), ClockRequest(), Clock).messages.values(),

@@ -25,11 +25,11 @@ from fleet.live.arm.body import SimulatedBody
 from fleet.live.arm.estimator import Estimator, NominalPeaks
 from fleet.live.arm.node import ArmConfig, ArmNode
 from fleet.live.auction.knowledge import LiveFleet
-from fleet.live.auction.rounds import Timing
 from fleet.live.clock import FleetClock
-from fleet.live.consensus.jobs import GrantRecord
 from fleet.live.consensus.node import ConsensusNode, Membership
 from fleet.live.journal import Journal
+from fleet.live.leases import Timing
+from fleet.live.records import BookRecord
 from fleet.robot import ThermalLimits
 from scenarios.live.arm import refuse_auctioneer
 from tests.waiting import PATIENCE_S
@@ -70,7 +70,7 @@ def bus(tmp_path, small):
             own = small.arm(ROSTER.index(name), [small.work(place) for place in PLACES])
             plans = {(work.kind, work.places[0].name): plans for work, plans in own.plans.items()}
             book = stack.enter_context(Journal(tmp_path / f"{name}.journal", ArmRecord))
-            grants = stack.enter_context(Journal(tmp_path / f"{name}.grants", GrantRecord))
+            grants = stack.enter_context(Journal(tmp_path / f"{name}.grants", BookRecord))
             history = ArmHistory().replay(book.records()).after_restart(name, 0.0)
             book.rewrite(*history.compact())
             link = stack.enter_context(BusClient(router.endpoint, "f"))
@@ -130,7 +130,7 @@ def bus(tmp_path, small):
                 kill(name)
             for path in tmp_path.glob("*.journal"):
                 with Journal(path, ArmRecord) as book:
-                    closed = [each for each in book.records() if isinstance(each, Closed)]
+                    closed = [each.report for each in book.records() if isinstance(each, Closed)]
                 done.update(report.job for report in closed if report.outcome == "finished")
             return done
 
@@ -152,7 +152,7 @@ def bus(tmp_path, small):
 
 def settled(bus, *names):
     """Return whether every present arm knows that these jobs are finished."""
-    return all(set(names) <= one.work_source.participant.granter.register.settled.keys() for one in bus.arms.values())
+    return all(all(map(one.work_source.book.is_settled, names)) for one in bus.arms.values())
 
 
 @pytest.mark.ci_slow
@@ -231,9 +231,8 @@ def test_an_arm_that_lost_its_journals_does_not_join_unless_a_person_requests_it
     bus.kill(lost)
     bus.lose_journals(lost)
     back = bus.arm(lost, new_epoch=True)
-    register = back.work_source.participant.granter.register
     assert bus.serve(lambda: back.work_source._begun)
-    assert {"a", "b"} <= register.settled.keys()
+    assert all(map(back.work_source.book.is_settled, "ab"))
     bus.submit(hold("a"), hold("c"))
     assert bus.serve(lambda: settled(bus, "c"))
     bus.kill(lost)

@@ -29,10 +29,10 @@ from fleet.bus.protocol.operator import Cancel, Change, ClearRequest, ControlReq
 from fleet.live.arm.awards import ArmHistory, AwardExecutor
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.clock import FleetClock
-from fleet.live.consensus.jobs import GrantRecord
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
 from fleet.live.journal import Journal
+from fleet.live.records import BookRecord
 from tests.live.test_poison import GROWN_BYTES, SILENT_S, Wire, odd, resident
 from tests.profiles import examples
 
@@ -79,7 +79,7 @@ class Arm:
 def node(tmp_path_factory):
     with ExitStack() as stack:
         path = tmp_path_factory.mktemp("poison") / "grants"
-        journal = stack.enter_context(Journal(path, GrantRecord, sync=lambda file: None))
+        journal = stack.enter_context(Journal(path, BookRecord, sync=lambda file: None))
         membership = Membership(fleet=LiveFleet(arms=ROSTER), choose=Consensus().choose)
         node = ConsensusNode(Arm(), membership, journal, boot=1)
         node._take_epoch("e")

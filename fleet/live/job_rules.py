@@ -1,30 +1,108 @@
-"""Which jobs are accepted, which can begin, and the reply to a status request: the same with and without auctioneer."""
+"""Rules about jobs: which are accepted, which can begin, which have left, and the reply to a status request."""
 
 # The stubs of networkx leave the results of its functions unknown.
 # pyright: standard
 
+from collections import deque
 from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
+from hashlib import blake2b
 from itertools import accumulate
+from struct import iter_unpack, pack
 
 import networkx as nx
-from msgspec import UNSET
+from msgspec import UNSET, Struct
 from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import MOST_JOBS, SETTLED, Admission, JobSpec, JobStatus, Status
-from fleet.bus.protocol.messages import encode
+from fleet.bus.protocol.messages import LISTED_BYTES, State, encode
 from fleet.bus.protocol.operator import Change
-from fleet.live.auction.records import PastJobs
 
 MAX_OPEN_JOBS = 10_000
 """Jobs of one auctioneer that are neither finished nor given up; more are refused."""
-MAX_BYTES = 60_000
-"""Size of the statuses in one reply: a router may drop larger messages."""
 REASON_LENGTHS = (300, 80, 0)
 """Characters of a reason in a reply to a submission: the first of these with which the reply fits into one message."""
 SHIFT_ENDED = "The shift ended before it was done."
 
-
 NONE: Mapping[str, str] = {}
+MAX_PAST = 100_000
+"""Jobs whose names are known after they have left the book."""
+
+
+def hash_of(content: bytes) -> int:
+    """Return 64 bits, the same in every process."""
+    return int.from_bytes(blake2b(content, digest_size=8).digest(), "little")
+
+
+def content_hash(message: Struct) -> int:
+    """Return a hash of the content of a message."""
+    return hash_of(encode(message))
+
+
+def _spec_hash(job: JobSpec) -> int:
+    """Hash of a job without the lowest bit, which says whether it was finished."""
+    return content_hash(job) & ~1
+
+
+class PastJobs(Container[str]):
+    """Names and outcomes of the last jobs that have left a book: two hashes each, 16 bytes.
+
+    A job that is settled leaves memory and journal; the recording has it. Its name must not be used again: a submission
+    that is repeated late would be done twice. At one job in 10 s, `MAX_PAST` names are those of 11 days.
+
+    Attributes:
+        limit: How many are known at most.
+    """
+
+    def __init__(self, packed: bytes = b"", limit: int = MAX_PAST) -> None:
+        """Start with jobs as `packed` returns them."""
+        self.limit = limit
+        self._jobs: dict[int, int] = {}
+        self._order: deque[int] = deque()
+        for name, value in iter_unpack("<QQ", packed):
+            self._put(name, value)
+
+    def add(self, job: JobSpec | str, *, finished: bool) -> None:
+        """Add a job that is finished, or given up; the oldest one is dropped if there are too many.
+
+        Args:
+            job: A job, or the name of one of unknown content, which is the same as any other of that name.
+        """
+        name, content = (job, 0) if isinstance(job, str) else (job.name, _spec_hash(job))
+        self._put(hash_of(name.encode()), content | finished)
+
+    def __contains__(self, name: object) -> bool:
+        return isinstance(name, str) and hash_of(name.encode()) in self._jobs
+
+    def __len__(self) -> int:
+        return len(self._jobs)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, PastJobs) and self._jobs == other._jobs
+
+    __hash__ = None  # pyright: ignore[reportAssignmentType]
+
+    def is_same(self, job: JobSpec) -> bool:
+        """Return whether a job of this name is known, and is this one."""
+        return self._jobs.get(hash_of(job.name.encode()), -1) & ~1 in (0, _spec_hash(job))
+
+    def is_finished(self, name: str) -> bool:
+        """Return whether a job of this name is known, and was finished."""
+        return bool(self._jobs.get(hash_of(name.encode()), 0) & 1)
+
+    def is_given_up(self, name: str) -> bool:
+        """Return whether a job of this name is known, and was given up."""
+        return not self._jobs.get(hash_of(name.encode()), 1) & 1
+
+    def packed(self) -> bytes:
+        """Return all jobs, oldest first."""
+        return b"".join(pack("<QQ", name, self._jobs[name]) for name in self._order)
+
+    def _put(self, name: int, value: int) -> None:
+        if name not in self._jobs:
+            self._order.append(name)
+            if len(self._order) > self.limit:
+                del self._jobs[self._order.popleft()]
+        self._jobs[name] = value
 
 
 def reason_for_silence(arm: str) -> str:
@@ -96,7 +174,7 @@ def _in_one_message(replies: Sequence[Admission]) -> tuple[Admission, ...]:
     """Return the replies with their reasons as short as one message needs: a router may drop a larger one."""
     for length in REASON_LENGTHS:
         replies = [replace(reply, reason=reply.reason[:length]) for reply in replies]
-        if sum(len(encode(reply)) + 1 for reply in replies) <= MAX_BYTES:
+        if sum(len(encode(reply)) + 1 for reply in replies) <= LISTED_BYTES:
             break
     return tuple(replies)
 
@@ -231,6 +309,12 @@ def with_terms(status: JobStatus, job: JobSpec | None) -> JobStatus:
     return replace(status, repetitions=job.repetitions, due_s=job.due_s, value=job.value, release_s=job.release_s)
 
 
+def finish_s(status: JobStatus, state: State | None) -> float | None:
+    """Return the expected fleet time at which a job is finished, by the last state of its arm; None for unknown."""
+    at_work = status.state in ("awarded", "finishing") and state is not None and state.job == status.job
+    return state.time_s + state.busy_s if at_work and state is not None else None
+
+
 def status_reply(
     name: str,
     time_s: float,
@@ -253,4 +337,4 @@ def status_reply(
         kept = sorted(kept, key=lambda status: status.state in SETTLED)[:MOST_JOBS]
     sizes = accumulate((len(encode(status)) + 1 for status in kept), initial=len(encode(reply)))
     next(sizes)
-    return replace(reply, jobs=tuple(status for status, size in zip(kept, sizes, strict=True) if size <= MAX_BYTES))
+    return replace(reply, jobs=tuple(status for status, size in zip(kept, sizes, strict=True) if size <= LISTED_BYTES))

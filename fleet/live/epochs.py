@@ -1,0 +1,143 @@
+"""Epochs: who has lost a journal, or has an older copy, must not have jobs done again that arms have done.
+
+The epoch is the name of a journal of the auctioneer, which arms get with every award and keep on disk. Before an arm
+counts as present, the auctioneer asks what it has finished and what it has. If an arm knows another epoch, the journal
+was lost: no jobs are accepted, unless a new epoch was requested. Then the auctioneer adopts what the arms know.
+
+Without an auctioneer all arms keep one epoch. An arm whose journals are lost has forgotten what it granted and what was
+done: it does not take part beside arms that know it, unless a person requests it (`--new-epoch`). Then it adopts what
+the present arms have done and have.
+"""
+
+from collections.abc import Iterable
+
+from fleet.bus.client import BusClient
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import MOST_JOBS, Award, JobSpec
+from fleet.bus.protocol.consensus import History, HistoryRequest, JobOutcome, with_finished
+from fleet.errors import BusError
+from fleet.live.book import JobBook
+from fleet.live.job_rules import is_same_work
+from fleet.live.journal import EpochBegun, JobsAccepted
+from fleet.live.records import BookRecord, ClaimNumbered, Granted, HistoryAdopted, JobSettled
+
+REPLY_S = 1.0
+"""Real seconds that an arm has to reply."""
+MAX_NAMED = 5
+"""Jobs that an error names."""
+REMEDY = (
+    "Stop the auctioneer and bring the journal back, or start with --new-epoch: then jobs that the arms have done are "
+    "not done again, and all other jobs of the old journal must be submitted again."
+)
+
+
+def ask_arms(link: BusClient) -> tuple[History, ...]:
+    """Return what the present arms have done and have."""
+    key = keys.of_every_arm(link.fleet, "history")
+    return tuple(link.query_and_wait(key, HistoryRequest(), History, timeout_s=REPLY_S).messages.values())
+
+
+def check_begin(fleet: str, histories: Iterable[History]) -> None:
+    """Check that no arm knows an epoch, so that an auctioneer may begin with an empty journal.
+
+    Raises:
+        BusError: an arm does.
+    """
+    for history in histories:
+        if history.epoch:
+            raise BusError(f"The journal is empty, but fleet '{fleet}' has worked: {describe(history)}. {REMEDY}")
+
+
+def describe(history: History) -> str:
+    """Return what an arm knows, in words."""
+    names = [job.name for job in history.finished[-MAX_NAMED:]]
+    done = f"{len(history.finished)} finished job(s), the last ones {', '.join(names)}" if names else "no finished job"
+    return f"'{history.arm}' knows the epoch '{history.epoch}', {done}, and has {len(history.awards)} job(s)"
+
+
+REMEDY_OF_ARM = (
+    "Jobs could be done twice. Stop this arm and bring its journals back, or start it with --new-epoch: then it adopts "
+    "what the present arms have done and have; what only absent arms know is lost."
+)
+
+
+def check_journals(arm: str, number: int, epoch: str, histories: Iterable[History], *, new_epoch: bool = False) -> None:
+    """Check that the journals of an arm are those that its peers know.
+
+    Args:
+        number: As `first_number` returns it.
+        new_epoch: Whether a person has requested that the arm begins without the journals that its peers know.
+
+    Raises:
+        BusError: they are lost, older copies, or of another epoch: jobs might be done twice.
+    """
+    for peer in (history for history in histories if history.arm != arm):
+        claimed = peer.claims.get(arm, -1)
+        if "" not in (epoch, peer.epoch) and epoch != peer.epoch:
+            raise BusError(
+                f"The journals of '{arm}' are of the epoch '{epoch}', but {describe(peer)}. Jobs could be done twice. "
+                "Bring the right journals back, or put these aside and start the arm with --new-epoch."
+            )
+        lost = claimed >= number or (claimed >= 0 and peer.epoch and not epoch)
+        if lost and not new_epoch:
+            raise BusError(
+                f"'{peer.arm}' knows claims of '{arm}' that its journals do not: they are lost, or older copies; "
+                f"{describe(peer)}. {REMEDY_OF_ARM}"
+            )
+
+
+def history_of(arm: str, book: JobBook) -> History:
+    """Return the finished jobs, and those with permission to commit, as many as one message holds."""
+    reason = f"The journals of its arm were lost; '{arm}' had granted it permission to commit."
+    committed = tuple(
+        JobOutcome(entry.name, entry.award, grant.record.arm, "unfinished", entry.cycles, book.time_s, reason)
+        for entry in book.jobs.values()
+        if (grant := entry.grant) is not None and grant.may_commit
+    )[:MOST_JOBS]
+    entries = (book.jobs[name] for name in book.in_order if book.is_finished(name))
+    jobs = [job for entry in entries if (job := entry.original) is not None]
+    return with_finished(History(arm, book.epoch, (), claims=dict(book.numbers), committed=committed), jobs)
+
+
+def adopted(book: JobBook, history: History) -> list[BookRecord]:
+    """Return what this participant takes over from an arm: jobs that it finished, and jobs that it or others have.
+
+    An arm leases its awards at the auctioneer that gave them; arms without one name those to whom they have given
+    permission to commit.
+    """
+    records: list[BookRecord] = []
+    if history.epoch and not book.epoch:
+        records.append(EpochBegun(history.epoch))
+
+    def is_open(job: JobSpec) -> bool:
+        if (entry := book.jobs.get(job.name)) is None:
+            return job.name not in book.past and job.name not in book.aside
+        return entry.state == "waiting" and (entry.spec is None or is_same_work(entry.spec, job))
+
+    unknown = tuple(job for job in history.finished if is_open(job))
+    if unknown:
+        records.append(HistoryAdopted(history.arm, unknown, book.time_s))
+    done = {job.name for job in unknown}
+    for award in history.awards:
+        if award.auctioneer != book.name or award.job.name in done or not is_open(award.job):
+            continue
+        if book.grant_of(award.award) is None:
+            records.append(JobsAccepted((award.job,), f"adopted from {history.arm}", book.time_s))
+            records.append(_adopted_award(award, history, book.time_s))
+    for outcome in history.committed:
+        entry = book.jobs.get(outcome.job)
+        if book.is_settled(outcome.job) or (entry is not None and entry.grant is not None):
+            continue
+        if outcome.arm == book.name:  # it may have done the last cycle, and does not know
+            records.append(JobSettled(outcome))
+        else:
+            terms = (outcome.award, outcome.job, outcome.arm, book.time_s, outcome.cycles, (outcome.job,))
+            records.append(Granted(*terms, may_commit=True))
+            records.append(ClaimNumbered(outcome.arm, history.claims.get(outcome.arm, 0)))
+    return records
+
+
+def _adopted_award(award: Award, history: History, time_s: float) -> Granted:
+    terms = (award.award, award.job.name, history.arm, time_s, award.cycles, award.job.stations)
+    may_commit = award.award in history.may_commit
+    return Granted(*terms, may_commit=may_commit, auction=award.auction, quote=award.quote, plan=award.plan)
