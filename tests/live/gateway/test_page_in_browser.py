@@ -185,7 +185,7 @@ def test_a_job_is_changed_and_settled_and_the_space_of_an_absent_arm_freed(serve
 
 def test_a_fault_is_told_in_words_and_reset(served, fleet, open_page):
     page = open_page(served)
-    fleet.mode["arm_1"], fleet.temp_c["arm_1"] = "faulted", 76.0
+    fleet.ahead_s, fleet.mode["arm_1"], fleet.temp_c["arm_1"] = 3600.0, "faulted", 76.0
     expect(page.locator("#arms tbody tr").nth(1)).to_contain_text("✖ faulted")
     expect(page.locator("#arms tbody tr").nth(1)).to_contain_text("above the limit")
     expect(page.locator("#alarms")).to_contain_text("arm_1 is faulted: joint ")
