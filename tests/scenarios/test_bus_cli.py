@@ -235,7 +235,7 @@ def reports(folder):
                 yield from (each.report for each in book.records() if isinstance(each, Closed))
 
 
-@pytest.mark.slow
+@pytest.mark.ci_slow
 @pytest.mark.parametrize("policy", ["matching", "consensus"])
 def test_a_whole_fleet_works_with_tls_and_access_control(thermofleet, small_toml, plans, tmp_path, policy):
     """Processes of their own for router, arms, auctioneer and recorder: what they need of each other is allowed."""

@@ -175,8 +175,8 @@ def rights(fleet: str, participant: RosterEntry, *, by_consensus: bool = False) 
 
 
 def rights_by_role(fleet: str, name: str) -> dict[Role, Rights]:
-    """The rights that a participant of this name would have in each role."""
-    return {role: rights(fleet, RosterEntry(name, role)) for role in get_args(Role)}
+    """The rights that a participant of this name may have in each role, in a fleet with or without an auctioneer."""
+    return {role: rights(fleet, RosterEntry(name, role), by_consensus=True) for role in get_args(Role)}
 
 
 def access_control(roster: Roster, router: str = "router") -> dict[str, Any]:
