@@ -17,7 +17,7 @@ from urllib.parse import quote
 import zenoh
 from zenoh import ext
 
-STATE_S, CYCLE_S, VALID_S, RENEW_S = 0.1, 0.1, 3.0, 0.5
+STATE_S, CYCLE_S, VALID_S, RENEW_S, LEAVE_S = 0.1, 0.1, 3.0, 0.5, 5.0
 LIMIT_C, AMBIENT_C = 60.0, 25.0
 DRIFT = 0.01  # largest relative difference between two clocks: our measure of a lease must end first
 
@@ -35,6 +35,8 @@ class Arm:
         self.acks = {}  # name of an award -> our reply
         self.job = None  # the current job
         self.reports = {}  # name of an award -> a report without receipt
+        self.leaving = False
+        self.closed = False  # our space may be closed to other arms, until a quote without a job
 
     def query_clock(self):
         """Return the fleet time at zero of our clock, and its speed; without an auctioneer, our own time at speed 1."""
@@ -51,7 +53,7 @@ class Arm:
         return self.zero_s + self.speed * time.monotonic()
 
     def run(self, seconds):
-        """Take part in the fleet for this time."""
+        """Take part in the fleet for this time, or until Ctrl-C; then leave it in order."""
         for topic, name in (("quote", "QuoteRequest"), ("award", "Award")):
             self.session.declare_queryable(f"{self.own_key}/{topic}", self.enqueue(topic, name), complete=True)
         alive = self.session.liveliness().declare_token(f"{self.own_key}/alive")
@@ -59,9 +61,24 @@ class Arm:
         info.put(json.dumps({"arm": self.name, "joints": 1, "twin": "mock"}))
         self.difficulty = self.declare_publisher("difficulty", "DifficultyScores", 1)
         print(f"ready {self.name}", flush=True)
+        try:
+            self.serve(seconds, lambda: False)
+        finally:
+            self.leave()
+            alive.undeclare()
+
+    def leave(self):
+        """Return the job, and reply to one quote after the receipt: then our space is free, and nobody misses us."""
+        self.leaving = True
+        if self.job:
+            self.report("returned")
+        self.serve(LEAVE_S, lambda: not (self.reports or self.closed))
+
+    def serve(self, seconds, is_done):
+        """Reply, work and publish for this time, or until it is done."""
         tick_s = renewed_s = time.monotonic()
         end_s = tick_s + seconds
-        while (now := time.monotonic()) < end_s:
+        while (now := time.monotonic()) < end_s and not is_done():
             try:
                 self.inbox.get(timeout=max(0.0, tick_s - now))()
             except queue.Empty:
@@ -71,7 +88,6 @@ class Arm:
                 if (self.job or self.reports) and time.monotonic() > renewed_s + RENEW_S:
                     renewed_s = time.monotonic()
                     self.renew_lease()
-        alive.undeclare()
 
     def declare_publisher(self, topic, name, history):
         """Return a publisher whose last messages also reach late subscribers."""
@@ -106,6 +122,7 @@ class Arm:
         name = "" if request.get("dry_run") else f"{self.name}-{uuid.uuid4().hex}"  # unique, also after a restart
         done = request.get("cycles", {})
         estimates = [self.estimate(job, done.get(job["name"], 0)) for job in request["jobs"]]
+        self.closed &= bool(self.job or self.reports)
         if name:
             now = time.monotonic()
             self.quotes = {old: made_s for old, made_s in self.quotes.items() if now < made_s + VALID_S} | {name: now}
@@ -119,7 +136,7 @@ class Arm:
             "time_s": self.now_s(),
             "mode": "working" if self.job else "idle",
             "headroom_k": LIMIT_C - self.temp_c,
-            "capacity": 0 if self.job else 1,
+            "capacity": 0 if self.job or self.leaving else 1,
             "estimates": estimates,
         }
 
@@ -133,8 +150,8 @@ class Arm:
             "gained_k": 0.1 * cycles,
             "joint_difficulty": [d],
             "difficulty": d,
-            "duration_s": CYCLE_S * cycles,
-            "finish_in_s": CYCLE_S * cycles,
+            "duration_s": self.speed * CYCLE_S * cycles,  # in fleet time
+            "finish_in_s": self.speed * CYCLE_S * cycles,
         }
         return {"job": job["name"], "plans": [plan]}
 
@@ -148,9 +165,10 @@ class Arm:
                 reason = "The quote is unknown or too old."
             elif award.get("plan", 0) != 0:
                 reason = "The quote has no such plan."
-            elif self.job:
-                reason = "This arm has a job."
+            elif self.job or self.leaving:
+                reason = "This arm has a job, or leaves."
             else:
+                self.closed = True
                 # The arm measures the lease from its quote, the auctioneer from its award: the arm's lease ends first.
                 lease_s = award.get("lease_s", 6.0)
                 self.job = {

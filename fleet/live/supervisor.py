@@ -320,16 +320,19 @@ def _run_in_fork(
     """Run a command line in this fork of the supervisor, whose `Popen` would execute it after the return."""
     code: object = 1
     try:
-        null = os.open(os.devnull, os.O_RDWR)
-        for number in map(int, os.listdir("/proc/self/fd")):
-            if (
-                number > 2 and number != null
-            ):  # not closed, so that no object of the supervisor can close a new file of this number
-                os.dup2(null, number, inheritable=False)
-        os.environ.update(env)
+        # Before the parent goes on, which then may send a signal.
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for broken in (signal.SIGPIPE, signal.SIGXFSZ):  # errors, as in a new Python: `Popen` has set them to end it
+            signal.signal(broken, signal.SIG_IGN)
+        null = os.open(os.devnull, os.O_RDWR)
+        for number in map(int, os.listdir("/proc/self/fd")):
+            if number > 2 and number != null:  # not closed: no object of the supervisor can close a new file
+                os.dup2(null, number, inheritable=False)
+        os.environ.update(env)
+        if (numpy := sys.modules.get("numpy")) is not None:
+            numpy.random.seed()  # or a policy that uses it would draw the same numbers in every process
         logging.getLogger().handlers.clear()
         sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
         ctypes.CDLL(None).prctl(15, name.encode()[:15])  # PR_SET_NAME: shown by `ps` and `top`

@@ -185,7 +185,7 @@ def page_of(scenario: str, fleet: str, at: str, tls: Path | None, recording: Pat
     endpoint, port = at if tls is None else Tls(tls, "operator").endpoint(at), free_port(PAGE_PORT)
     words = ("bus", "gateway", "--page", "--scenario", scenario, "--endpoint", endpoint, "--fleet", fleet)
     argv = (*PROGRAM, *words, "--recording", str(recording), "--port", str(port))
-    return Part(name="page", argv=argv, rank=1, ready=f"{PAGE_READY}http://127.0.0.1:{port}/")
+    return Part(name="page", argv=argv, rank=4, ready=f"{PAGE_READY}http://127.0.0.1:{port}/")
 
 
 def _check_page(tls: Path | None) -> None:

@@ -596,7 +596,10 @@ def run_gateway(
     if recording is not None and any(recording.glob("alarms-*")):
         from scenarios.live.recording import alarms_of  # loads Arrow, 20 MB
 
-        kept = alarms_of(recording)
+        try:
+            kept = alarms_of(recording)
+        except FleetError as error:
+            _LOG.error("The alarms of the recording are not continued: %s", error)
     hooks = [Webhook(url, os.environ.get(SECRET, "")) for url in webhooks]
     roles = read_tokens(tokens) if tokens else {}
     if token:

@@ -42,16 +42,19 @@ class Webhook:
         """
         if len(secret) < MIN_SECRET:
             raise FleetError(f"--webhook needs a secret to sign with: set {SECRET} to {MIN_SECRET} or more characters.")
-        parts = urlsplit(url)
-        if parts.scheme not in ("http", "https") or not parts.hostname or parts.username:
-            raise FleetError(f"--webhook must be a URL such as http://127.0.0.1:9000/alarms (got '{url}').")
-        if parts.scheme == "http" and not _is_loopback(parts.hostname):
-            raise FleetError(f"--webhook beyond this machine must be https:// (got '{url}').")
         try:
-            self._port = parts.port or (443 if parts.scheme == "https" else 80)
+            parts = urlsplit(url)
+            host, port = parts.hostname or "", parts.port
         except ValueError as error:
             raise FleetError(f"--webhook: {error} (got '{url}').") from error
-        self.url, self._secret, self._host = url, secret.encode(), parts.hostname
+        wrong = parts.scheme not in ("http", "https") or not host or "@" in parts.netloc or port == 0
+        if wrong or any(char.isspace() for char in url):
+            raise FleetError(f"--webhook must be a URL such as http://127.0.0.1:9000/alarms (got '{url}').")
+        if parts.scheme == "http" and not _is_loopback(host):
+            raise FleetError(f"--webhook beyond this machine must be https:// (got '{url}').")
+        self._port = port or (443 if parts.scheme == "https" else 80)
+        self.url, self._secret, self._host = url, secret.encode(), host
+        self._named = f"[{host}]" if ":" in host else host
         self._tls = ssl.create_default_context() if parts.scheme == "https" else None
         self._path = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
         self._waiting: deque[bytes] = deque(maxlen=MOST_WAITING)
@@ -97,7 +100,7 @@ class Webhook:
         at = str(int(time.time()))
         signature = hmac.new(self._secret, at.encode() + b"." + body, hashlib.sha256).hexdigest()
         head = (
-            f"POST {self._path} HTTP/1.1\r\nHost: {self._host}:{self._port}\r\nContent-Type: application/json\r\n"
+            f"POST {self._path} HTTP/1.1\r\nHost: {self._named}:{self._port}\r\nContent-Type: application/json\r\n"
             f"Content-Length: {len(body)}\r\nX-Thermofleet-Signature: t={at},v1={signature}\r\n"
             "Connection: close\r\n\r\n"
         )

@@ -36,6 +36,7 @@ MARGIN_K = 3.0
 arm that faulted."""
 WEIGHS_PEAK = "wsept"
 """The built-in policy that weighs the predicted peak against the value of a job."""
+PAUSED = "had a break"
 PAUSE_S = 60.0
 """Two jobs of an arm count as one stretch of work if less time lies between them."""
 
@@ -294,6 +295,8 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
     if not able:
         return "no arm got a job of its kind"
     waits_s = _arm_time(log, able, begin_s, end_s)
+    if all(each.start_s >= late.due_s for each in log.plan.breaks):
+        waits_s.pop(PAUSED)  # it was late before
     most = max(waits_s, key=lambda why: waits_s[why])
     if not waits_s[most]:
         return f"what {names_text(able)} did meanwhile is not recorded"
@@ -304,7 +307,7 @@ def _arm_time(log: ShiftLog, able: Sequence[str], begin_s: float, end_s: float) 
     """Time of the arms that can do a job between its release and its award, s, by what they did; "": later jobs."""
     were = "were" if len(able) > 1 else "was"
     earlier, out = f"{were} at work since before its release", f"{were} out after a fault"
-    failed, paused = f"{were} out after a failure", "had a break"
+    failed, paused = f"{were} out after a failure", PAUSED
     hot, idle = f"{were} idle above the warning limit", f"{were} idle: its place was taken, or the policy let it wait"
     time_s: dict[str, float] = dict.fromkeys(("", earlier, out, failed, paused, hot, idle), 0.0)
     at_s = log.readings.time_s

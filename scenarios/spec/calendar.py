@@ -103,14 +103,17 @@ def _break_times(
         yield entry | {"begin_s": first_s, "end_s": last_s}
         return
     first, last = (_clock(given[name], f"{where}.{name}") for name in ("begin", "end"))
-    if last <= first and (_since_midnight_s(last) + DAY_S - _since_midnight_s(first)) > LONGEST_NIGHT_S:
+    to_midnight = (last == time() and first != last) or str(given["end"]).startswith("24:")
+    night_s = _since_midnight_s(last) + DAY_S - _since_midnight_s(first)
+    if last <= first and night_s > LONGEST_NIGHT_S and not to_midnight:
         raise ScenarioError(f"{where}: it ends at {given['end']}, before it begins at {given['begin']}.")
-    found = list[dict[str, Any]]()
+    found, touched = list[dict[str, Any]](), False
     for day_s, date in _days(given.get("weekdays", list(WEEKDAYS)), begin, horizon_s, f"{where}.weekdays"):
         begin_s, end_s = day_s(date, first), day_s(date + timedelta(days=last <= first), last)
-        if end_s > 0 and begin_s < horizon_s:
+        touched |= end_s > 0 and begin_s < horizon_s
+        if end_s > max(0.0, begin_s) and begin_s < horizon_s:  # not within the hour that summer time leaves out
             found.append(entry | {"begin_s": begin_s, "end_s": end_s})
-    if not found and "weekdays" not in given:
+    if not touched and "weekdays" not in given:
         raise ScenarioError(
             f"{where}: {given['begin']} to {given['end']} is outside the shift, which begins at {begin:%H:%M} and ends "
             f"{horizon_s / 3600.0:.3g} h later."

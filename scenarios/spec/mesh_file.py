@@ -59,13 +59,17 @@ def _with_surface(fixture: Fixture, file: Path, where: str) -> Fixture:
     centre_m = mesh.bounds.mean(axis=0)
     mesh.apply_translation(-centre_m)
     x, y, z = (rotation(fixture.tilt_deg) @ centre_m + fixture.position_m).round(DIGITS).tolist()
-    return Fixture(
-        name=fixture.name,
-        position_m=(x, y, z),
-        size_m=tuple(mesh.extents.round(DIGITS).tolist()),
-        tilt_deg=fixture.tilt_deg,
-        surface=surface_of(mesh.vertices, mesh.faces, _convex_parts(mesh, where)),
-    )
+    surface = surface_of(mesh.vertices, mesh.faces, _convex_parts(mesh, where))
+    try:
+        return Fixture(
+            name=fixture.name,
+            position_m=(x, y, z),
+            size_m=tuple(mesh.extents.round(DIGITS).tolist()),
+            tilt_deg=fixture.tilt_deg,
+            surface=surface,
+        )
+    except ValueError as error:
+        raise ScenarioError(f"{where} lies far from its origin: {error} Move the shape in the file.") from error
 
 
 def _read(file: Path, where: str) -> Any:

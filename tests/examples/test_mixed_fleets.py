@@ -1,13 +1,14 @@
 """Fleets of the examples alone, and of examples and thermofleet's own processes."""
 
 import re
+import signal
 import subprocess
 from contextlib import ExitStack
 
 import pytest
 
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import Result
+from fleet.bus.protocol.auction import Result, Status, StatusRequest
 from fleet.bus.protocol.messages import State
 from tests import commands
 from tests.examples.programs import killed_afterwards, program, running, started, submit_jobs
@@ -55,8 +56,19 @@ def test_own_arm_and_the_submitter_work_with_the_real_auctioneer(bus, tmp_path):
         for arm in range(4):  # they are offline, so their positions are unknown until then
             cleared = commands.run("arm", "clear", f"arm_{arm}", *at)
             assert cleared.stdout == f"arm_{arm}: its space is free until the arm reports its space again.\n"
-        with running("own_arm", port, "f", "a"), running("own_arm", port, "f", "b"):
+        with running("own_arm", port, "f", "a") as first, running("own_arm", port, "f", "b") as second:
             submit_jobs(port)
+            # They leave in order, one of them in the middle of a job: it goes back, and no space stays closed.
+            one = commands.run("job", "submit", "--kind", "hold", "--place", "belt", "--repetitions", "900", *at)
+            assert one.returncode == 0, one.stderr
+            serve_until(lambda: any(status.arm and status.job == "hold" for status in statuses), watcher)
+            for arm in (first, second):
+                arm.send_signal(signal.SIGINT)
+                assert arm.wait(PATIENCE_S) == 130
+            now = watcher.query_and_wait(keys.of_jobs("f", "status"), StatusRequest(), Status, timeout_s=PATIENCE_S)
+            (reply,) = now.messages.values()
+            assert not {"a", "b"} & reply.space.keys()
+            assert [status.state for status in reply.jobs if status.job == "hold"] == ["waiting"]
         auction.terminate()
         output = auction.communicate(timeout=PATIENCE_S)[1]
         assert auction.returncode == 0

@@ -118,7 +118,7 @@ def test_an_isolated_arm_does_not_report_that_all_jobs_are_settled(fleet_of):
     fleet.run(15.0)
     participant = fleet.node(isolated).work_source.participant
     real_s = fleet.world.processes[isolated].real_s
-    assert participant.open_jobs(real_s) == []
+    assert participant.open_jobs() == []
     assert not participant.all_settled(real_s)
 
 

@@ -150,7 +150,9 @@ def test_a_twin_is_calibrated_on_two_kinds_of_cool_motion_that_it_was_not_traine
     explores = replace(scenario, twin=replace(scenario.twin, exploration=9))
     (arm,) = arms(1)
     drawn = []
-    monkeypatch.setattr(rehearse, "light_jobs", lambda *some: drawn.append(light_jobs(*some)) or drawn[-1])
+    monkeypatch.setattr(
+        "fleet.arm.random_motions.light_jobs", lambda *some: drawn.append(light_jobs(*some)) or drawn[-1]
+    )
     seed = rehearse.arm_seed(0, 0)
     own = [plan for variants in plans.values() for plan in variants]
     twin = rehearse.train_twin(own, TINY, seed, scenario=explores, arm=arm)

@@ -324,14 +324,13 @@ def without_repeats(recording: Recording) -> Recording:
 
     A logger that is late repeats its last reading. Held on, a single reading in motion would count for seconds; without
     the repeated rows the heat in between is that of the readings on either side. Runs longer than `HEAT_GAP_S` and the
-    last row stay, and so do rows of an arm at rest, and all rows of a recording without temperatures.
+    last row stay, and so do all rows of a recording without temperatures, in which an arm at rest repeats.
     """
     if recording.temp_c is None:
         return recording
     rows = np.concatenate([values for name in READINGS if (values := getattr(recording, name)) is not None], axis=1)
     time_s, kept = recording.time_s, np.ones(len(rows), dtype=bool)
-    same = np.concatenate([[False], (np.diff(rows, axis=0) == 0).all(axis=1)])
-    for first, end in readings.runs(same & (recording.qd != 0).any(axis=1)):
+    for first, end in readings.runs(np.concatenate([[False], (np.diff(rows, axis=0) == 0).all(axis=1)])):
         last = min(end, len(rows) - 1)
         kept[first:last] = time_s[last] - time_s[first - 1] > HEAT_GAP_S
     return recording.part(kept)

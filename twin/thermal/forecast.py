@@ -265,7 +265,8 @@ def _end_of(so_far: Recording, motors: Motors, ambient_c: float) -> tuple[HeatLo
 
 def _cycle_of(plan: Recording, motors: Motors) -> HeatLog:
     """The heat of a repetition, in every interval between samples."""
-    plan = without_repeats(plan)
+    fresh = without_repeats(plan)
+    plan = fresh if len(fresh.time_s) >= LEAST_SAMPLES else plan  # of a constant plan nothing would be left
     silent = replace(plan, temp_c=np.tile(plan.time_s[:, None], plan.joints))  # of no use here, but never repeats
     logs = heat_logs(silent, motors, source_of([plan]), step_s=0.0)
     if len(plan.time_s) < LEAST_SAMPLES:

@@ -2,7 +2,7 @@
 
 import math
 import secrets
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from datetime import UTC, datetime
 
 from msgspec.structs import replace
@@ -12,6 +12,11 @@ from fleet.errors import Refused
 from fleet.live.monitor.health import Finding
 from fleet.live.monitor.snapshot import MAX_ALARMS
 
+LASTING = {
+    "absent": "{} is absent: it has left, or its process hangs or has ended.",
+    "space": "The space of {} stays closed to other arms, as it is not present.",
+}
+"""Texts of alarms whose findings name a state of the moment, by kind."""
 HOLD_S = 5.0
 """Real seconds without the finding after which an alarm ends: a finding that comes and goes raises one alarm."""
 
@@ -36,10 +41,14 @@ class AlarmList:
             if alarm.ended_s is None:
                 self._lasting[alarm.kind, alarm.subject] = alarm.alarm, math.inf
 
-    def update(self, findings: Sequence[Finding], time_s: float, real_s: float) -> list[Alarm]:
+    def update(
+        self, findings: Sequence[Finding], time_s: float, real_s: float, heard: Container[str] | None = None
+    ) -> list[Alarm]:
         """Begin and end alarms by the present findings; return those that have changed.
 
         Args:
+            heard: Arms and jobs of which the monitor knows: an alarm of another one lasts until a person has seen it,
+                for example that of an arm which fell silent before the monitor began. None: it knows of all.
             time_s: Fleet time.
             real_s: Real seconds of a monotonic clock.
         """
@@ -51,12 +60,17 @@ class AlarmList:
             name, _ = self._lasting.get(key, ("", 0.0))
             if not name and len(self._lasting) < MAX_ALARMS // 2:
                 name = secrets.token_hex(4)
-                alarm = Alarm(self.monitor, 0, time_s, name, finding.kind, finding.what, finding.subject, time_s)
+                what = LASTING.get(finding.kind, finding.what).format(finding.subject)
+                alarm = Alarm(self.monitor, 0, time_s, name, finding.kind, what, finding.subject, time_s)
                 changed.append(self._change(alarm, time_s))
             if name:
                 self._lasting[key] = name, real_s
         for key, (name, seen_s) in list(self._lasting.items()):
-            self._lasting[key] = name, min(seen_s, real_s)  # those of a recording were last seen now
+            seen_s = min(seen_s, real_s)  # those of a recording were last seen now
+            unheard = key[1] and heard is not None and key[1] not in heard
+            if unheard and not self.alarms[name].by:
+                seen_s = real_s
+            self._lasting[key] = name, seen_s
             if real_s - seen_s > HOLD_S:
                 del self._lasting[key]
                 changed.append(self._change(replace(self.alarms[name], ended_s=time_s), time_s))

@@ -222,7 +222,8 @@ class AsyncBridge:
         now = self._listener.view.snapshot(real_s)
         findings = check_fleet(now, self._earlier[0] if len(self._earlier) == self._earlier.maxlen else None)
         self._earlier.append(now)
-        for alarm in self._alarms.update(findings, self._time_s(), real_s):
+        heard = {each.arm for each in now.arms} | {each.job for each in now.jobs}
+        for alarm in self._alarms.update(findings, self._time_s(), real_s, heard):
             self._change(alarm)
 
     def _change(self, alarm: Alarm) -> None:

@@ -10,6 +10,7 @@ from typing import Literal
 import msgspec
 
 from fleet.live.clock import FleetClock
+from fleet.live.job_rules import SHIFT_ENDED
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetSnapshot
 
 REASONS = {
@@ -17,7 +18,7 @@ REASONS = {
     "has not been offered": "queue", "has a break": "break", "are planning": "planning",
     "is above its warning limit": "hot", "is faulted": "faulted", "It waits until": "space",
     "No arm can do it": "no_arm", "The policy lets it wait": "policy", "Its place was in use": "place",
-    "has a job": "busy",
+    "is in use": "place", "has a job": "busy",
 }  # fmt: skip
 """Class of the reason of a waiting job, by a part of it; the first part that it has counts."""
 EXPECTED = ("release", "predecessor", "paused", "queue", "break", "planning", "hot", "faulted")
@@ -143,12 +144,12 @@ def check_fleet(
 
 
 def check_jobs(fleet: FleetSnapshot) -> list[Finding]:
-    """Check that no job is unfinished or abandoned."""
+    """Check that no job is unfinished or abandoned; the end of the shift is no fault."""
     words = {"unfinished": "is unfinished, so its outcome is unknown", "given_up": "is abandoned"}
     return [
         Finding("warning", f"'{job.job}' {words[job.state]}: {job.reason or 'no reason'}", job.state, job.job)
         for job in fleet.jobs
-        if job.state in words
+        if job.state in words and job.reason != SHIFT_ENDED
     ]
 
 
@@ -173,8 +174,8 @@ def check_progress(fleet: FleetSnapshot, earlier: FleetSnapshot | None) -> list[
 
 
 def reason_class(reason: str) -> str:
-    """Class of the reason of a waiting job, of `REASONS`; "other" for any other one."""
-    return next((name for part, name in REASONS.items() if part in reason), "other")
+    """Class of the reason of a waiting job, of `REASONS`; "other" for any other one, "queue" for none yet."""
+    return "queue" if not reason else next((name for part, name in REASONS.items() if part in reason), "other")
 
 
 def _in_the_way(reason: str) -> list[str]:
