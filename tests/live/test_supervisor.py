@@ -217,7 +217,8 @@ from fleet.live.supervisor import Backoff, Part, Supervisor, exit_with_superviso
 BALLAST = [object() for _ in range(100_000)]
 def main(words):
     exit_with_supervisor()
-    print("ready", *words, os.environ["GIVEN"], len(BALLAST), os.getsid(0) == os.getpid(), flush=True)
+    ignores = signal.getsignal(signal.SIGPIPE) == signal.SIG_IGN  # a client that hangs up is no end of a process
+    print("ready", *words, os.environ["GIVEN"], len(BALLAST), os.getsid(0) == os.getpid() and ignores, flush=True)
     if words == ["exits"]:
         sys.exit(3)
     signal.pause()

@@ -78,7 +78,7 @@ def test_the_metrics_are_in_the_text_format_of_prometheus():
     assert types == {f"thermofleet_{name}": kind for name, (kind, _) in METRICS.items()}
     assert {name for name, _ in values} == set(types)
     assert value("jobs", state="waiting") == 2
-    assert (value("waiting_jobs", reason="space"), value("waiting_jobs", reason="other")) == (1, 1)
+    assert (value("waiting_jobs", reason="space"), value("waiting_jobs", reason="queue")) == (1, 1)
     assert value("oldest_waiting_seconds") == 60.0
     assert value("motor_temperature_celsius", arm=ODD, joint="2") == 55.5
     assert value("p_saturation", arm=ODD) == 0.25

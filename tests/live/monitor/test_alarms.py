@@ -6,10 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fleet.bus.protocol.auction import JobStatus
+from fleet.bus.protocol.operator import Alarm
 from fleet.errors import Refused
+from fleet.live.job_rules import SHIFT_ENDED
 from fleet.live.monitor.alarms import HOLD_S, AlarmList
-from fleet.live.monitor.health import Finding
-from fleet.live.monitor.snapshot import MAX_ALARMS, FleetView
+from fleet.live.monitor.health import Finding, check_jobs
+from fleet.live.monitor.snapshot import MAX_ALARMS, FleetSnapshot, FleetView
 from tests.live.monitor.messages import state
 
 HOT = Finding("warning", "a is faulted.", "fault", "a")
@@ -106,3 +109,23 @@ def test_work_and_heat_are_sums_over_the_time_between_states():
     view.update("a", state(time_s=500.0, epoch="new", tau=(9.0, 9.0, 9.0)), 0.0)  # another epoch has another clock
     (arm,) = view.snapshot(0.0).arms
     assert (arm.worked_s, arm.heat_n2m2s) == (10.0, 270.0)
+
+
+def test_an_alarm_of_an_unheard_arm_lasts_until_somebody_has_seen_it():
+    """A monitor that begins anew does not know the arm that fell silent before, so its silence tells nothing."""
+    silent = Alarm("m", 1, 10.0, "a1", "absent", "arm_2 is absent", "arm_2", 10.0)
+    alarms = AlarmList("m", [silent])
+    for second in range(20):
+        assert alarms.update([], 20.0 + second, float(second), heard={"arm_1"}) == []
+    alarms.acknowledge("a1", "ada", 41.0, NOON)
+    ended = [each for second in range(20, 40) for each in alarms.update([], 60.0, float(second), heard={"arm_1"})]
+    assert [each.ended_s for each in ended] == [60.0]
+
+
+def test_the_end_of_the_shift_raises_no_alarm_and_the_text_of_an_absence_stays_true():
+    lasting = Finding("fault", "arm_1 publishes its state but shows no token", "absent", "arm_1")
+    (begun,) = AlarmList("m").update([lasting], 5.0, 5.0)
+    assert begun.what == "arm_1 is absent: it has left, or its process hangs or has ended."
+    jobs = (JobStatus("a", "unfinished", reason=SHIFT_ENDED), JobStatus("b", "unfinished", reason="An arm stopped."))
+    fleet = FleetSnapshot("f", (), (), {}, jobs)
+    assert [finding.subject for finding in check_jobs(fleet)] == ["b"]
