@@ -122,10 +122,7 @@ def run_fleet(
         raise no_simulator(spec.policy)
     refuse_other_way(folder / "journals", names, alone=scope_of(spec.policy) == "arm", new_epoch=spec.new_epoch)
     wanted = (0,) if router else (PORT, 0) if port is None else (port,)
-    with (
-        hold_port(*wanted) as held,
-        progress_bar() as progress,
-    ):  # planning may take minutes, and the port is taken first
+    with hold_port(*wanted) as held, progress_bar() as progress:  # planning may take minutes: the port is taken first
         own_port = held.getsockname()[1]
         for module in (*SHARED, *(SHARED_BY_PAGE if page else ())):  # first, so that the memory of `prepare` is freed
             import_module(module)
@@ -148,7 +145,9 @@ def run_fleet(
     share_memory()
     from scenarios.cli.main import main
 
-    with until_stopped() as stop, Supervisor(folder / "logs", program=PROGRAM, main=main) as supervisor:
+    # The module of a policy of others may have begun what a fork cannot share: random numbers, threads, open files.
+    forked = None if ":" in spec.policy else main
+    with until_stopped() as stop, Supervisor(folder / "logs", program=PROGRAM, main=forked) as supervisor:
         if not router:
             supervisor.start(own_router, ready_s=START_S)
         # The auctioneer starts last: its clock runs from its start, and the arms must be ready by then.
