@@ -314,7 +314,7 @@ def _arms(scenario: Scenario) -> Table:
 def _jobs(scenario: Scenario) -> Table:
     """One row per stream, as sentences that fit any terminal."""
     rows = tuple(
-        (s.name, f"{_work(s)}\nworth {s.value:g}, due after {s.due_s / 60:g} min; {_arrivals(scenario, s)}")
+        (s.name, f"{_work(s)}\nworth {s.value:g}, due after {duration(s.due_s)}; {_arrivals(scenario, s)}")
         for s in scenario.jobs[:MOST_STREAMS]
     )
     more = len(scenario.jobs) - MOST_STREAMS
