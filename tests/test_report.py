@@ -472,3 +472,16 @@ def test_late_jobs_turn_the_badge_red_and_abandoned_ones_come_last() -> None:
     assert lateness_text(log, late_jobs(log)[1:2]) == (
         "long-1 finished 1 min late: its work takes 15 min, and it was due 14 min after its release."
     )
+
+
+def test_a_break_after_the_due_date_is_no_reason_to_be_late() -> None:
+    pause = event(300.0, "break", job="", value=600.0), event(900.0, "break_end", job="")
+    events = (event(0.0, "release", job="late-1"), *done("other-1", 1.0, 250.0), *pause)
+    log = replace(
+        log_of(telemetry(1000), ("arm_a", "arm_b"), events, {"status": "finished"}),
+        jobs=(record("late-1", 200.0, "waiting"), record("other-1", 900.0)),
+        offers=(offered("late-1", 1.0, 100.0), offered("other-1", 1.0, 249.0)),
+    )
+    assert "break" not in lateness_text(log, late_jobs(log))
+    before = replace(log, jobs=(record("late-1", 400.0, "waiting"), record("other-1", 900.0)))
+    assert lateness_text(before, late_jobs(before)).endswith("arm_a had a break.")
