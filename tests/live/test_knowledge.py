@@ -65,6 +65,7 @@ def planning_at_once(monkeypatch):
             self._estimator.prepare(*job)
 
     monkeypatch.setattr(PlanningThread, "plan", plan)
+    monkeypatch.setattr("fleet.live.arm.node.IDLE_PERIOD_S", 0.0)  # the fleet's time does not pass here
 
 
 class Scores:
@@ -133,7 +134,7 @@ class LiveShift:
         )
         config = ExecutorConfig(valid_s=HOUR_S)
         executor = AwardExecutor(name, lambda *_: None, ArmHistory(), nonce="n", config=config)
-        clock = SimpleNamespace(speed=1e3, real_s=0.0, epoch="e", now_s=lambda _: self.time_s)
+        clock = SimpleNamespace(speed=1e3 * world.dt_s, real_s=0.0, epoch="e", now_s=lambda _: self.time_s)
         return ArmNode(
             self.wires[name],
             body,

@@ -27,6 +27,7 @@ from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Granter
 from fleet.live.consensus.participant import QUIET_S, Membership, Participant
 from fleet.live.desk import JobDesk
 from fleet.live.epochs import REPLY_S, adopted, ask_arms, check_journals, history_of
+from fleet.live.job_rules import SHIFT_ENDED
 from fleet.live.journal import EpochBegun, Journal, Started, TimeRecorder, own_records
 from fleet.live.records import BookRecord
 
@@ -232,7 +233,7 @@ class ConsensusNode(JobDesk):
             return
         self._ended_s, executor = real_s, self.participant.executor
         if executor.active and not executor.active[0].may_commit:
-            executor.return_all(time_s, real_s, "the shift is over")
+            executor.return_all(time_s, real_s, SHIFT_ENDED)
 
     def _set_time(self, time_s: float, real_s: float) -> None:
         self._begun = True
