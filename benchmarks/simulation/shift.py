@@ -1,7 +1,7 @@
 """One simulated life of a fleet: jobs and faults by one seed, rules after every event, and all settled at the end.
 
 Rules besides those of `simulated_fleet`: after the faults every job is finished, given up for the reasons that the
-product names, or unfinished because an arm stopped in its last cycle; every wait ends, and has a reason that is told;
+product names, or unfinished because an arm stopped in its last cycle; every wait ends, and has a stated reason;
 arms that are idle at home take no space; requests of people have their effect (`steering`); the recording has every
 result once (`recording`).
 """

@@ -98,7 +98,7 @@ MAX_SETTLED = 2_000
 """Finished and given-up jobs whose status is kept; older ones leave the book, and only `PastJobs` knows them."""
 MAX_UNKNOWN = 4 * MAX_OPEN_JOBS
 """Jobs of which only the name is known, from peers; the first ones leave if there are more."""
-MAX_AWARDS = 16
+MAX_ENDED = 16
 """Ended awards of one job on which a report is still expected."""
 PLAIN = ("time_s", "number", "ended", "epoch", "succeeds", "checks", "operated")
 """Fields of a book that its snapshot holds as they are."""
@@ -503,7 +503,7 @@ class JobBook(TimedState[BookRecord]):
         if (before := entry.grant) is not None:
             self._end(before, "dropped")
         counts = {award: grant for award, grant in entry.grants.items() if grant.outcome != "refused"}
-        old = [award for award, grant in counts.items() if grant.outcome and not grant.may_commit][:-MAX_AWARDS]
+        old = [award for award, grant in counts.items() if grant.outcome and not grant.may_commit][:-MAX_ENDED]
         grant = Grant(replace(record, offers=()), record.may_commit)
         entry.grants = {award: each for award, each in counts.items() if award not in old} | {record.award: grant}
         self.open[record.award], entry.award, entry.arm = grant, record.award, record.arm

@@ -24,7 +24,7 @@ from fleet.live.records import NO_AWARD, Requested, requested_job
 
 _LOG = logging.getLogger(__name__)
 
-MAX_AWARDS = 16
+MAX_REDONE = 16
 """Awards of one job that were redone, in one request."""
 ALREADY_DONE = "This request was carried out before."
 NO_CHANGE = "Nothing changed: it is so already."
@@ -63,7 +63,7 @@ def operation_of(book: JobBook, request: ControlRequest, time_s: float) -> Opera
     match request.action:
         case Settle(job, "redo") if (entry := book.jobs.get(job)) is not None:
             last = (entry.award,) if entry.state == "unfinished" and entry.award not in ("", NO_AWARD) else ()
-            awards = (*book.operations.redone(job), *last)[-MAX_AWARDS:]
+            awards = (*book.operations.redone(job), *last)[-MAX_REDONE:]
         case _:
             pass
     epoch = book.epoch if book.is_central else ""

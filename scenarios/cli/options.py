@@ -138,7 +138,7 @@ def _plain(kind: Any, known: Option) -> Any:
 
 
 def flags_of(value: object, *names: str) -> tuple[str, ...]:
-    """Words of a command line that give these fields of a dataclass; those that are empty or False are left out."""
+    """Arguments of a command line that give these fields of a dataclass; those that are empty or False are left out."""
     words: list[str] = []
     for name in names:
         given, flag = getattr(value, name), options_of(type(value))[name].flag or f"--{name.replace('_', '-')}"

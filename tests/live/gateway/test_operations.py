@@ -111,9 +111,9 @@ def test_an_alarm_is_shown_acknowledged_and_published(gateway, arm, router):
         assert (seen["kind"], seen["by"], seen["ended_s"]) == ("given_up", "", None)
         assert gateway.ask("POST", "/v4/alarms", {"alarm": seen["alarm"], "by": " "})[0] == 409
         assert gateway.ask("POST", "/v4/alarms", {"alarm": "none", "by": "ann"})[0] == 409
-        status, _, told = gateway.ask("POST", "/v4/alarms", {"alarm": seen["alarm"], "by": "ann"})
-        assert (status, told["by"]) == (200, "ann")
-        assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", told["acknowledged"])
+        status, _, seen_by = gateway.ask("POST", "/v4/alarms", {"alarm": seen["alarm"], "by": "ann"})
+        assert (status, seen_by["by"]) == (200, "ann")
+        assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", seen_by["acknowledged"])
         assert gateway.ask("POST", "/v4/alarms", {"alarm": seen["alarm"], "by": "bob"})[0] == 409
 
         def published():
@@ -147,12 +147,12 @@ def test_events_of_unknown_kinds_are_counted_together(gateway, router):
 
 
 async def receiver(replies, requests):
-    """A server that gives these statuses in turn, and keeps what it received; None: it never replies."""
+    """A server that gives these statuses in turn, and puts what it received into a queue; None: it never replies."""
 
     async def handle(reader, writer):
         head = (await reader.readuntil(b"\r\n\r\n")).decode()
         length = int(re.search(r"Content-Length: (\d+)", head)[1])
-        requests.append((head, await reader.readexactly(length)))
+        requests.put_nowait((head, await reader.readexactly(length)))
         status = replies.pop(0) if replies else 200
         if status is None:
             await reader.read()  # until the sender gives up
@@ -168,20 +168,20 @@ def test_a_webhook_is_signed_and_repeated_until_it_is_accepted(monkeypatch):
     """A target that fails, and one that never replies, get the alarm again; the next alarm comes after it."""
     monkeypatch.setattr(webhooks, "RETRY_S", (0.01, 0.01, 0.01))
     monkeypatch.setattr(webhooks, "REPLY_S", 0.2)
-    requests = []
 
     async def run():
+        requests = asyncio.Queue()
         async with await receiver([500, None, 204], requests) as server:
             hook = Webhook(f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}/in?x=1", SECRET)
             task = asyncio.create_task(hook.run())
             hook.send(ALARM)
             hook.send(msgspec.structs.replace(ALARM, number=2))
             async with asyncio.timeout(PATIENCE_S):
-                while len(requests) < 4:
-                    await asyncio.sleep(0.01)
+                received = [await requests.get() for _ in range(4)]
             task.cancel()
+            return received
 
-    asyncio.run(run())
+    requests = asyncio.run(run())
     assert [json.loads(body)["number"] for _, body in requests] == [1, 1, 1, 2]
     for head, body in requests:
         assert head.startswith("POST /in?x=1 HTTP/1.1\r\n")
@@ -191,14 +191,15 @@ def test_a_webhook_is_signed_and_repeated_until_it_is_accepted(monkeypatch):
 
 def test_a_target_that_never_replies_holds_a_bounded_number_of_alarms_and_nothing_else():
     async def run():
-        async with await receiver([None] * 100, []) as server:
+        requests = asyncio.Queue()
+        async with await receiver([None] * 100, requests) as server:
             hook = Webhook(f"http://localhost:{server.sockets[0].getsockname()[1]}", SECRET)
             task = asyncio.create_task(hook.run())
             for number in range(10 * MOST_WAITING):
                 hook.send(msgspec.structs.replace(ALARM, number=number))
-            await asyncio.wait_for(asyncio.sleep(0.05), 1.0)
+            await asyncio.wait_for(requests.get(), PATIENCE_S)
             task.cancel()
-            await asyncio.sleep(0.1)  # the server closes, too
+            await asyncio.gather(task, return_exceptions=True)
             return len(hook._waiting)
 
     assert asyncio.run(run()) <= MOST_WAITING
