@@ -7,7 +7,7 @@ from fleet.errors import FleetError, install
 EXTRAS = {
     "cli": ("rich", "typer"),
     "twin": ("joblib", "sklearn", "torch"),
-    "bus": ("zenoh",),
+    "bus": ("apsw", "zenoh"),
     "tls": ("cryptography",),
     "report": ("jinja2", "matplotlib", "pandas", "PIL", "plotly", "pyarrow", "trimesh"),
     "film": ("av",),

@@ -77,7 +77,6 @@ def start_fleet(fault: Fault, folder: Path, *, speed: float) -> Iterator[Fleet]:
         client = stack.enter_context(BusClient(endpoint, SCENARIO))
         session = stack.enter_context(open_client(endpoint, timeout_s=5.0))
         fleet = Fleet(supervisor, client, router.ready, session, folder, arms, keys=place, cut=cut, clocks=clocks)
-        stack.callback(fleet.journals.close)
         fleet.cut_arms = cut_arms
         fleet.listen()
         if math.isinf(

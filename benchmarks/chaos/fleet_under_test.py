@@ -2,7 +2,9 @@
 
 import math
 import os
+import shutil
 import signal
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -10,7 +12,6 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import msgspec
 import zenoh
 
 from fleet.bus.client import BusClient
@@ -26,7 +27,9 @@ from fleet.bus.protocol.auction import (
     SubmissionReply,
 )
 from fleet.bus.protocol.messages import State
+from fleet.errors import JournalError
 from fleet.live.arm.awards import ArmRecord, Closed, JobsFinished
+from fleet.live.journal import Journal
 from fleet.live.supervisor import Supervisor
 
 TIMEOUT_S = 150.0
@@ -218,57 +221,51 @@ class Fault:
     """Number of arms that can be cut off; 0 for half of them."""
 
 
-class _Line(msgspec.Struct):
-    records: list[ArmRecord]
-
-
-_DECODER = msgspec.json.Decoder(_Line)
-
-
 class JournalFiles:
-    """Journals of arms, with all files that they were.
+    """What the journals of arms have told since the start, also if a compaction has left it out since."""
 
-    A journal is compacted, and at each start rewritten, into a new file. The old one stays readable here, because it is
-    kept open.
-    """
+    EVERY_S = 0.2
+    """Real seconds between two readings of a journal, which is compacted less often."""
 
     def __init__(self, folder: Path) -> None:
         """Follow the journals of a folder, which need not exist yet."""
         self._folder = folder
-        self._files: dict[Path, list[int]] = {}
+        self._read_s: dict[Path, float] = {}
+        self._ended: dict[str, set[tuple[str, str]]] = {}
+        """Finished jobs with their awards, by arm."""
+        self._named: dict[str, set[str]] = {}
+        """Jobs that an arm names as finished, by arm."""
 
-    def follow(self) -> None:
-        """Open what is new; to be called more often than journals are rewritten."""
+    def follow(self, every_s: float = EVERY_S) -> None:
+        """Read what is due; to be called more often than journals are compacted."""
         for path in self._folder.glob("*.journal"):
-            files = self._files.setdefault(path, [])
-            if path.stem != "auctioneer" and not (files and os.path.samestat(os.fstat(files[-1]), path.stat())):
-                files.append(os.open(path, os.O_RDONLY | os.O_CLOEXEC))
+            if path.stem != "auctioneer" and time.monotonic() >= self._read_s.get(path, 0.0) + every_s:
+                self._read_s[path] = time.monotonic()
+                for record in records_of(path):
+                    if isinstance(record, Closed) and record.report.outcome == "finished":
+                        self._ended.setdefault(path.stem, set()).add((record.report.job, record.report.award))
+                    elif isinstance(record, JobsFinished):
+                        self._named.setdefault(path.stem, set()).update(job.name for job in record.jobs)
 
     def count_finished(self) -> Counter[str]:
-        """Count how often each job was finished: once for each award, and at least once if an arm names it."""
-        self.follow()
-        ended: set[tuple[str, str]] = set()
-        named: set[str] = set()
-        for files in self._files.values():
-            for file in files:
-                for record in _records(file):
-                    if isinstance(record, Closed) and record.report.outcome == "finished":
-                        ended.add((record.report.job, record.report.award))
-                    elif isinstance(record, JobsFinished):
-                        named.update(job.name for job in record.jobs)
-        done = Counter(job for job, _ in ended)
-        done.update(named - done.keys())
+        """Count how often each job was finished: once for each award, and at least once by each arm that names it."""
+        self.follow(every_s=0.0)
+        done: Counter[str] = Counter()
+        for arm in self._ended.keys() | self._named.keys():
+            ended = Counter(job for job, _ in self._ended.get(arm, ()))
+            done.update(ended)
+            done.update(self._named.get(arm, set()) - ended.keys())
         return done
 
-    def close(self) -> None:
-        """Close all files."""
-        for files in self._files.values():
-            for file in files:
-                os.close(file)
-            files.clear()
 
-
-def _records(file: int) -> list[ArmRecord]:
-    """Records of the complete lines."""
-    lines = os.pread(file, os.fstat(file).st_size, 0).splitlines(keepends=True)
-    return [record for line in lines if line.endswith(b"\n") for record in _DECODER.decode(line).records]
+def records_of(path: Path) -> list[ArmRecord]:
+    """Return the records of an arm's journal by a copy, as its process has it open; none if it changes meanwhile."""
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            for each in (path, path.with_name(f"{path.name}-wal")):
+                if each.exists():
+                    shutil.copyfile(each, Path(folder) / each.name)
+            with Journal[ArmRecord](Path(folder) / path.name, ArmRecord, durable=False) as journal:
+                return list(journal.records())
+        except (JournalError, OSError):
+            return []

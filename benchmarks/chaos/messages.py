@@ -12,7 +12,7 @@ from copy import deepcopy
 
 import msgspec
 
-from benchmarks.chaos.fleet_under_test import Fleet
+from benchmarks.chaos.fleet_under_test import Fleet, records_of
 from docs.bus_contract import EXAMPLES
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
@@ -29,6 +29,7 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.consensus import Bid, Claim
 from fleet.bus.protocol.messages import MalformedMessage, State, decode, encode, encoding
 from fleet.bus.protocol.operator import ClearRequest
+from fleet.live.arm.awards import AwardAccepted
 
 MALFORMED = 100_000
 
@@ -91,14 +92,8 @@ def replayed_awards(fleet: Fleet) -> float:
 
 def awards_of(fleet: Fleet, arm: str) -> list[Award]:
     """Return the awards of an arm, by its journal."""
-    path = fleet.folder / "journals" / f"{arm}.journal"
-    lines = [json.loads(line)["records"] for line in path.read_bytes().splitlines() if line.endswith(b"}")]
-    return [
-        msgspec.convert(record["award"], Award)
-        for records in lines
-        for record in records
-        if record["type"] == "award_accepted"
-    ]
+    records = records_of(fleet.folder / "journals" / f"{arm}.journal")
+    return [record.award for record in records if isinstance(record, AwardAccepted)]
 
 
 def _every_key(fleet: str, arms: tuple[str, ...]) -> list[keys.ParsedKey]:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,8 @@ def main() -> int:
         return 0
     from benchmarks.fuzz.targets import TARGETS
 
+    if find_spec("atheris") is None:
+        parser.error("Fuzzing needs atheris: `make fuzz` installs it.")
     failed = 0
     for name in chosen.targets or TARGETS:
         inputs = round(chosen.inputs * TARGETS[name].share)

@@ -4,14 +4,16 @@ import dataclasses
 import gzip
 import json
 import logging
+import sqlite3
 import tempfile
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from docs.bus_contract import EXAMPLES
@@ -130,16 +132,24 @@ def job_seeds() -> Iterator[bytes]:
 
 
 def journal(data: bytes) -> None:
-    """A journal: as it is, or, if the second byte is even, with right checksums; the first byte says whose."""
+    """A journal: as it is, or, if the second byte is even, rows with right checksums; the first byte says whose."""
     kind = JOURNALS[data[0] % len(JOURNALS)] if data else JOURNALS[0]
-    content = data[2:]
+    path = written("journal", b"")
+    path.with_name("journal-wal").unlink(missing_ok=True)
     if data[1:2] and data[1] % 2 == 0:
-        lines = [line for line in content.split(b"\n") if line]
-        content = b"".join(b'{"crc":"%08x","records":%s}\n' % (zlib.crc32(line), line) for line in lines)
-    path = written("journal", content)
+        with Journal[Any](path, kind, durable=False):
+            pass
+        crc = 0
+        with closing(sqlite3.connect(path)) as database, database:
+            for row, line in enumerate(filter(None, data[2:].split(b"\n")), start=1):
+                text = line.decode(errors="replace")
+                crc = zlib.crc32(text.encode(), crc)
+                database.execute("INSERT INTO journal VALUES (?, ?, ?)", (row, text, crc))
+    else:
+        path.write_bytes(data[2:])
     with (
         suppress(FleetError),
-        Journal[Any](path, kind, sync=lambda file: None, quarantine=lambda record, reason: ()) as book,
+        Journal[Any](path, kind, durable=False) as book,
     ):
         records = list(book.records())
         if kind is ArmRecord:
@@ -163,7 +173,9 @@ def journal_seeds() -> Iterator[bytes]:
         for record in records:
             yield bytes([number, 0]) + json.dumps([record]).encode()
         yield bytes([number, 0]) + json.dumps(records).encode()
-        yield bytes([number, 1]) + b'{"crc":"00000000","records":[]}\n'
+        with Journal[Any](written("seed", b""), ArmRecord, durable=False) as seed:
+            seed.append(msgspec.convert(records[0], ArmRecord))
+        yield bytes([number, 1]) + seed.path.read_bytes()
 
 
 def log(data: bytes) -> None:

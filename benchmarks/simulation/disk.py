@@ -1,17 +1,19 @@
 """A simulated disk: files in memory that may be full, fail, or lose what was not written through.
 
-`Disk` offers the calls of `os` that `fleet.live.journal` uses, and `DiskPath` those of `pathlib.Path`. A crash is
-possible before, in the middle of, and after each call that changes a file.
+`Disk` offers calls of `os`, `DiskPath` those of `pathlib.Path`, and `SqliteFiles` is the file system of the journals'
+SQLite (https://sqlite.org/vfs.html). A crash is possible before, in the middle of, and after each call that changes a
+file.
 """
 
 import errno
-import io
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from random import Random
-from types import SimpleNamespace
 from typing import Any
+
+import apsw
 
 
 class Crash(BaseException):  # no handler of the product may catch it
@@ -24,10 +26,40 @@ class Crash(BaseException):  # no handler of the product may catch it
 
 @dataclass(eq=False)
 class File:
-    """Content of a file, and how much of it is written through."""
+    """Content of a file, what of it is written through, and the writes since."""
 
     data: bytearray = field(default_factory=bytearray)
-    synced: int = 0
+    synced: bytes = b""
+    unsynced: list[tuple[int, bytes | None]] = field(default_factory=list[tuple[int, bytes | None]])
+    """Where, and what; None: truncated there."""
+
+    def write(self, start: int, content: bytes) -> None:
+        self.change(start, content)
+        self.unsynced.append((start, content))
+
+    def truncate(self, size: int) -> None:
+        self.change(size, None)
+        self.unsynced.append((size, None))
+
+    def change(self, start: int, content: bytes | None) -> None:
+        if content is None:
+            del self.data[start:]
+            return
+        if start > len(self.data):
+            self.data += bytes(start - len(self.data))
+        self.data[start : start + len(content)] = content
+
+    def sync(self) -> None:
+        self.synced, self.unsynced = bytes(self.data), []
+
+    def lose(self, rng: Random) -> None:
+        """Lose writes since the last sync: any of them, or the end of one."""
+        unsynced, self.unsynced, self.data = self.unsynced, [], bytearray(self.synced)
+        for start, content in unsynced:
+            if (chance := rng.random()) < 0.7:
+                torn = content if content is None or chance < 0.5 else content[: rng.randrange(len(content) + 1)]
+                self.change(start, torn)
+        self.synced = bytes(self.data)
 
 
 class Disk:
@@ -47,8 +79,8 @@ class Disk:
         self.names: dict[str, File] = {}
         self._durable: dict[str, File] = {}
         self._open: dict[int, tuple[str, File]] = {}
-        self._locked: dict[int, str] = {}
         self._next = 1000
+        self.connections: list[SimulatedConnection] = []
 
     def path(self, name: str) -> "DiskPath":
         """Path of a file."""
@@ -63,14 +95,16 @@ class Disk:
                 self.names.pop(name, None)
                 if name in self._durable:
                     self.names[name] = self._durable[name]
-        for file in self.names.values():
-            kept = self._rng.randint(file.synced, max(file.synced, len(file.data)))
-            del file.data[kept:]
+        for name in sorted(self.names):
+            self.names[name].lose(self._rng)
+        self._durable = dict(self.names)
 
     def close_all(self) -> None:
         """Close what an ended process had open."""
         self._open.clear()
-        self._locked.clear()
+        for connection in self.connections:
+            connection.die()
+        self.connections.clear()
         self.crash_in, self._crashed = 0, False
 
     # Calls of `os`
@@ -81,76 +115,86 @@ class Disk:
             self._open[self._next] = "", File()
             return self._next
         if path.name not in self.names:
-            self._before("create")
-            self.names[path.name] = File()
+            self.create(path.name)
         file = self.names[path.name]
         if flags & os.O_TRUNC:
-            file.data.clear()
-            file.synced = 0
+            file.truncate(0)
         self._open[self._next] = path.name, file
         return self._next
 
     def close(self, handle: int) -> None:
         self._open.pop(handle, None)
-        self._locked.pop(handle, None)
-
-    def dup(self, handle: int) -> int:
-        return handle
-
-    def fstat(self, handle: int) -> Any:
-        return SimpleNamespace(st_size=len(self._open[handle][1].data))
 
     def write(self, handle: int, content: bytes | memoryview) -> int:
         file, content = self._open[handle][1], bytes(content)
-        part = self._rng.randrange(len(content) + 1)
+        if len(content) > 1 and self._rng.random() < 0.05:
+            content = content[: self._rng.randrange(1, len(content))]
+        self.write_at(file, len(file.data), content)
+        return len(content)
+
+    def write_at(self, file: File, start: int, content: bytes) -> None:
+        """Write at a place of a file, as pwrite(2)."""
+        part = content[: self._rng.randrange(len(content) + 1)]
         if self.full:
-            file.data += content[: part // 2]
+            file.write(start, part)
             raise OSError(errno.ENOSPC, "No space left on device")
         if self.crash_in == 1:
-            file.data += content[:part]
+            file.write(start, part)
         self._before("write")
-        if len(content) > 1 and self._rng.random() < 0.05:
-            content = content[: max(1, part)]
-        file.data += content
-        return len(content)
+        file.write(start, content)
 
     def fsync(self, handle: int) -> None:
         name, file = self._open[handle]
+        self.sync(file if name else None)
+
+    def sync(self, file: File | None) -> None:
+        """Write a file through, or the names of the folder."""
         self._before("fsync")
         if self.broken:
             self.broken -= 1
             if not self.broken:
                 raise OSError(errno.EIO, "Input/output error")
-        if name:
-            file.synced = len(file.data)
-        else:
+        if file is None:
             self._durable = dict(self.names)
+        else:
+            file.sync()
         self._before("return from fsync")
 
-    def ftruncate(self, handle: int, size: int) -> None:
-        file = self._open[handle][1]
+    def truncate(self, file: File, size: int) -> None:
+        """Cut a file."""
         self._before("truncate")
-        del file.data[size:]
-        file.synced = min(file.synced, size)
-
-    def flock(self, handle: int, operation: int) -> None:
-        name = self._open[handle][0]
-        if name in self._locked.values():
-            raise BlockingIOError
-        self._locked[handle] = name
-
-    def read(self, handle: int) -> io.BytesIO:
-        return io.BytesIO(bytes(self._open[handle][1].data))
+        file.truncate(size)
 
     def replace(self, draft: str, name: str) -> None:
         self._before("rename")
         self.names[name] = self.names.pop(draft)
+
+    def create(self, name: str) -> None:
+        """Create an empty file."""
+        self._before("create")
+        self.names[name] = File()
+
+    def remove(self, name: str) -> None:
+        """Remove a file."""
+        self._before("unlink")
+        self.names.pop(name, None)
+
+    def random_bytes(self, count: int) -> bytes:
+        """Return random bytes, the same in every run of a seed."""
+        return self._rng.randbytes(count)
+
+    def end_if_crashed(self) -> None:
+        """End the process, if it has crashed in a call whose error somebody has caught."""
+        if self._crashed:
+            raise Crash("a call of SQLite", power=self.power)
 
     def unlink(self, name: str) -> None:
         if not self._crashed:  # a killed process cleans nothing up
             self.names.pop(name, None)
 
     def _before(self, call: str) -> None:
+        if self._crashed:
+            raise Crash(call, power=self.power)
         if self.crash_in:
             self.crash_in -= 1
             if not self.crash_in:
@@ -176,6 +220,9 @@ class DiskPath:
 
     def __str__(self) -> str:
         return self.name
+
+    def touch(self, mode: int = 0o666) -> None:
+        self.disk.close(self.disk.open(self, 0, mode))
 
     def exists(self) -> bool:
         return self.name in self.disk.names
@@ -246,12 +293,171 @@ class _Reader(_Log):
 
 
 class DiskCalls:
-    """Stands for `os` in the journal module: calls go to the disk of the running process, the rest to `os`."""
+    """Stands for `os` in a module: calls go to the disk of the running process, the rest to `os`."""
 
     def __init__(self, disk: Callable[[], Disk]) -> None:
         self._disk = disk
 
     def __getattr__(self, name: str) -> Any:
-        if name in ("open", "close", "dup", "fstat", "write", "fsync", "ftruncate"):
+        if name in ("open", "close", "write", "fsync"):
             return getattr(self._disk(), name)
         return getattr(os, name)
+
+
+# SQLite
+
+
+class SimulatedConnection(apsw.Connection):
+    """A connection to a database on a simulated disk. A crash during a call ends the call, as it ends the process."""
+
+    def __init__(self, files: "SqliteFiles", disk: Disk, name: str) -> None:
+        self.disk, self.alive = disk, True
+        self._key = files.add(self)
+        disk.connections.append(self)
+        super().__init__(f"/{self._key}/{name}", vfs=files.NAME)
+
+    def die(self) -> None:
+        """End with the process, which can change no file any more."""
+        self.alive = False
+        self.close(True)
+
+    def execute(self, *args: Any, **options: Any) -> Any:
+        with self._crash():
+            return super().execute(*args, **options)
+
+    def pragma(self, *args: Any, **options: Any) -> Any:
+        with self._crash():
+            return super().pragma(*args, **options)
+
+    def __exit__(self, *error: Any) -> Any:
+        with self._crash():
+            return super().__exit__(*error)
+
+    @contextmanager
+    def _crash(self) -> Iterator[None]:
+        try:
+            yield
+        finally:
+            self.disk.end_if_crashed()
+
+
+class SqliteFiles(apsw.VFS):
+    """The file system of all simulated databases; `with` it, SQLite knows it. Names are `/CONNECTION/FILE`."""
+
+    NAME = "simulated"
+
+    def __init__(self) -> None:
+        super().__init__(self.NAME, base="")
+        self._connections: list[SimulatedConnection] = []
+
+    def __enter__(self) -> "SqliteFiles":
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.unregister()
+
+    def add(self, connection: SimulatedConnection) -> int:
+        """Add a connection, and return its number."""
+        self._connections.append(connection)
+        return len(self._connections) - 1
+
+    def _find(self, path: Any) -> tuple[SimulatedConnection, str]:
+        _, number, name = path.split("/")
+        return self._connections[int(number)], name
+
+    def xOpen(self, name: Any, flags: list[int]) -> Any:
+        connection, file = self._find(name.filename() if isinstance(name, apsw.URIFilename) else name)
+        log = bool(flags[0] & (apsw.SQLITE_OPEN_WAL | apsw.SQLITE_OPEN_MAIN_JOURNAL))
+        if connection.alive and file not in connection.disk.names:
+            with _errors():
+                connection.disk.create(file)
+        return SqliteFile(connection, connection.disk.names.get(file, File()), syncs_names=log)
+
+    def xDelete(self, filename: str, syncdir: bool) -> None:
+        connection, file = self._find(filename)
+        if connection.alive:
+            with _errors():
+                connection.disk.remove(file)
+                if syncdir:
+                    connection.disk.sync(None)
+
+    def xAccess(self, pathname: str, flags: int) -> bool:
+        connection, file = self._find(pathname)
+        return file in connection.disk.names
+
+    def xFullPathname(self, name: str) -> str:
+        return name
+
+    def xRandomness(self, numbytes: int) -> bytes:
+        return self._connections[-1].disk.random_bytes(numbytes)
+
+    def xCurrentTime(self) -> float:
+        return 2_460_000.5
+
+    def xSleep(self, microseconds: int) -> int:
+        return microseconds
+
+    def xGetLastError(self) -> tuple[int, str]:
+        return 0, ""
+
+
+class SqliteFile:
+    """One open file of a simulated database."""
+
+    def __init__(self, connection: SimulatedConnection, file: File, *, syncs_names: bool) -> None:
+        self._connection, self._file, self._syncs_names = connection, file, syncs_names
+
+    def xRead(self, amount: int, offset: int) -> bytes:
+        return bytes(self._file.data[offset : offset + amount])
+
+    def xWrite(self, data: bytes, offset: int) -> None:
+        if self._connection.alive:
+            with _errors():
+                self._connection.disk.write_at(self._file, offset, bytes(data))
+
+    def xTruncate(self, size: int) -> None:
+        if self._connection.alive:
+            with _errors():
+                self._connection.disk.truncate(self._file, size)
+
+    def xSync(self, flags: int) -> None:
+        if self._connection.alive:
+            with _errors():
+                self._connection.disk.sync(self._file)
+                if self._syncs_names:  # the first sync of a new log, as SQLite does on Unix
+                    self._connection.disk.sync(None)
+                    self._syncs_names = False
+
+    def xFileSize(self) -> int:
+        return len(self._file.data)
+
+    def xFileControl(self, op: int, pointer: int) -> bool:
+        return False
+
+    def xDeviceCharacteristics(self) -> int:
+        return apsw.SQLITE_IOCAP_POWERSAFE_OVERWRITE
+
+    def xSectorSize(self) -> int:
+        return 4096
+
+    def xLock(self, level: int) -> None:
+        """Do nothing: no other process uses the disk."""
+
+    xUnlock = xLock
+
+    def xCheckReservedLock(self) -> bool:
+        return False
+
+    def xClose(self) -> None:
+        """Do nothing."""
+
+
+@contextmanager
+def _errors() -> Iterator[None]:
+    """Turn an error of the disk, or the crash of the process, into one of SQLite."""
+    try:
+        yield
+    except OSError as error:
+        raise (apsw.FullError if error.errno == errno.ENOSPC else apsw.IOError)(str(error)) from None
+    except Crash as crash:
+        raise apsw.IOError(str(crash)) from None

@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 from msgspec.structs import replace as changed
 
 from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Operation, Pause, Resume, Settle
-from fleet.errors import JournalError, Refused
-from fleet.live import journal as journal_module
+from fleet.errors import Refused
 from fleet.live import steering as steering_module
 from fleet.live.arm.awards import ArmHistory, AwardAccepted, AwardExecutor, Closed
 from fleet.live.auction import auctioneer as auctioneer_module
@@ -27,7 +26,7 @@ from fleet.live.consensus.grants import Claimant, Granter
 from fleet.live.job_rules import PastJobs, content_hash
 from fleet.live.journal import CommitPermitted, JobsAccepted, Journal, Released
 from fleet.live.leases import Timing
-from fleet.live.records import Checked, Granted, JobSettled, Requested
+from fleet.live.records import Granted, JobSettled, Requested
 from fleet.live.supervisor import Supervisor
 from scenarios.live.recorder import GapFetcher, Recorder
 
@@ -68,11 +67,11 @@ def applied(name: str) -> Iterator[None]:
 
 
 def unwritten(kind: type | UnionType) -> Callable[[Any], Any]:
-    """Journal whose records of one kind are not written, nor the checks that would notice it."""
+    """Journal whose records of one kind are not written."""
 
     def make(append: Any) -> Any:
         def patched(self: Any, *records: Any) -> None:
-            append(self, *(record for record in records if not isinstance(record, kind | Checked)))
+            append(self, *(record for record in records if not isinstance(record, kind)))
 
         return patched
 
@@ -152,18 +151,6 @@ def _ends_free(end: Any) -> Any:
     return lambda self, grant, outcome, *, moved=True: end(self, grant, outcome, moved=False)
 
 
-def _reads_torn_lines(lines: Any) -> Any:
-    """Take an unfinished last line for a record."""
-
-    def patched(self: Any, quarantine: Any) -> Any:
-        size = sum(len(line) for line, _ in lines(self, None))
-        if size < journal_module.os.fstat(self._file).st_size:
-            raise JournalError("damaged")
-        yield from lines(self, quarantine)
-
-    return patched
-
-
 def _nobody_in_the_way(original: Any) -> Any:
     return lambda arm, space, taken, excludes: ()
 
@@ -189,9 +176,8 @@ add_mutation(
 add_mutation(
     "no-fsync",
     "a record is written through",
-    (Journal, "__init__", lambda start: lambda self, *a, **k: start(self, *a, **{**k, "sync": lambda file: None})),
+    (Journal, "__init__", lambda start: lambda self, *a, **k: start(self, *a, durable=False, **k)),
 )
-add_mutation("torn-line-read", "an unfinished last line is removed", (Journal, "_lines", _reads_torn_lines))
 add_mutation(
     "lease-forgotten",
     "after a restart open awards count as leased",

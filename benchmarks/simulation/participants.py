@@ -12,8 +12,10 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
+import apsw
+
 from benchmarks.simulation.bus import SimulatedClient
-from benchmarks.simulation.disk import Disk, DiskCalls, DiskPath
+from benchmarks.simulation.disk import Disk, DiskPath, SimulatedConnection, SqliteFiles
 from benchmarks.simulation.machine import Deeds, SimulatedArm, SimulatedEstimator
 from benchmarks.simulation.recording import simulated_files
 from benchmarks.simulation.world import Process, World
@@ -44,7 +46,7 @@ RETRY_S = 1.0
 
 def _journal(process: Process, name: str, kind: Any) -> Any:
     path: Any = process.disk.path(name)
-    return Journal[Any](path, kind, sync=process.disk.fsync).open()
+    return Journal[Any](path, kind).open()
 
 
 class ArmProcess:
@@ -254,9 +256,11 @@ def simulated_system(world: World) -> Iterator[None]:
         assert world.running is not None
         return world.running.disk
 
-    replace(journal_module, "os", DiskCalls(disk))
-    replace(journal_module, "open", lambda handle, mode: nullcontext(disk().read(handle)))
-    replace(journal_module, "fcntl", SimpleNamespace(LOCK_EX=0, LOCK_NB=0, flock=lambda h, o: disk().flock(h, o)))
+    def connection(name: str) -> SimulatedConnection:
+        return SimulatedConnection(files, disk(), name)
+
+    files = SqliteFiles()
+    replace(journal_module, "apsw", SimpleNamespace(**{**vars(apsw), "Connection": connection}))
     replace(
         supervisor_module,
         "subprocess",
@@ -268,7 +272,7 @@ def simulated_system(world: World) -> Iterator[None]:
     replace(arm_module, "plan_key", lambda plan: plan.space)
     replace(arm_module, "space_name", str)
     try:
-        with world.installed(), simulated_files(disk):
+        with files, world.installed(), simulated_files(disk):
             yield
     finally:
         for module, name, value in reversed(replaced):

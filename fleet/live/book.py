@@ -26,15 +26,13 @@ from bisect import insort
 from collections import deque
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from zlib import crc32
 
-import msgspec
 from msgspec.structs import asdict, replace
 
 from fleet.bus.protocol.auction import ABANDONED, SETTLED, Admission, JobSpec, JobState, JobStatus, Offers, Result
 from fleet.bus.protocol.consensus import JobOutcome
 from fleet.bus.protocol.keys import HISTORY
-from fleet.bus.protocol.messages import MOST_COUNT, encode
+from fleet.bus.protocol.messages import MOST_COUNT
 from fleet.bus.protocol.operator import ALL_ARMS, Cancel, Change, Operation, Pause, Resume, Settle
 from fleet.errors import JournalFull
 from fleet.job import reason_to_give_up
@@ -69,7 +67,6 @@ from fleet.live.records import (
     NO_AWARD,
     BookRecord,
     BookSnapshot,
-    Checked,
     ClaimNumbered,
     ContactLost,
     ContactRegained,
@@ -80,7 +77,6 @@ from fleet.live.records import (
     HistoryAdopted,
     JobEntry,
     JobSettled,
-    JobsQuarantined,
     Operations,
     Requested,
     ShiftEnded,
@@ -100,13 +96,8 @@ MAX_UNKNOWN = 4 * MAX_OPEN_JOBS
 """Jobs of which only the name is known, from peers; the first ones leave if there are more."""
 MAX_ENDED = 16
 """Ended awards of one job on which a report is still expected."""
-PLAIN = ("time_s", "number", "ended", "epoch", "succeeds", "checks", "operated")
+PLAIN = ("time_s", "number", "ended", "epoch", "succeeds", "operated")
 """Fields of a book that its snapshot holds as they are."""
-
-
-def reason_of_aside(reason: str) -> str:
-    """Return why a job is unfinished that is quarantined."""
-    return f"Quarantined, because the journal is wrong about it: {reason}. Settle it as done or redo."
 
 
 def _outcome_hash(outcome: JobOutcome | None) -> int:
@@ -160,14 +151,6 @@ class JobBook(TimedState[BookRecord]):
     until the arm states which space it takes."""
     numbers: dict[str, int] = field(default_factory=dict[str, int])
     """Number of the last claim, by arm."""
-    aside: dict[str, str] = field(default_factory=dict[str, str])
-    """Why jobs are quarantined of which only the name is known, by name."""
-    checks: int = 0
-    """Number of the last `Checked` record."""
-    unchecked: set[str] = field(default_factory=set[str], repr=False, compare=False)
-    """Names of the jobs that have changed since."""
-    _unnoted: bool = field(default=False, repr=False, compare=False)
-    """Something has changed since the last `Checked`."""
     _awaited: dict[str, dict[str, None]] = field(default_factory=dict[str, dict[str, None]], repr=False, compare=False)
     """Names of the jobs that wait for each job, settled ones included, in the order of their submission."""
     _unknown: dict[str, None] = field(default_factory=dict[str, None], repr=False, compare=False)
@@ -207,7 +190,6 @@ class JobBook(TimedState[BookRecord]):
         """
         if not records:
             return
-        records = (*self.checks_due(), *records)
         self._keep(*records)
         for record in records:
             for change in self.apply(record):
@@ -236,20 +218,11 @@ class JobBook(TimedState[BookRecord]):
             past=self.past.packed(),
             left=dict(self.left),
             numbers=dict(self.numbers),
-            aside=dict(self.aside),
             names=dict(self.operations.names),
             operations=self.operations.all,
             requested=tuple(self.requested),
         )
         return snapshot, Started(self.name, self.time_s)
-
-    def checks_due(self) -> tuple[Checked, ...]:
-        """Return what to write before the next records, so that a replay notices if those before are wrong."""
-        if not self._unnoted:
-            return ()
-        jobs = {name: digest(self, name) for name in sorted(self.unchecked) if name in self.jobs}
-        paused = dict(self.operations.paused)
-        return (Checked(self.checks + 1, self.number, self.operated, jobs, self.time_s, paused),)
 
     # Questions
 
@@ -285,7 +258,6 @@ class JobBook(TimedState[BookRecord]):
             ended=self.ended,
             given_up=given_up,
             past=self.past,
-            aside=self.aside,
         )
 
     def ready(self, time_s: float, limit: int, *, excluded: Container[str] = ()) -> list[JobSpec]:
@@ -308,11 +280,11 @@ class JobBook(TimedState[BookRecord]):
             return entry.state == "finished"
         if not self.is_central:
             return self.past.is_finished(name)
-        return name not in self.aside and not self.past.is_given_up(name)
+        return not self.past.is_given_up(name)
 
     def is_known(self, name: str) -> bool:
-        """Return whether a job was accepted here, also if it has left or its description is lost."""
-        return name in self.past or name in self.aside or (name in self.jobs and self.jobs[name].spec is not None)
+        """Return whether a job was accepted here, also if it has left."""
+        return name in self.past or (name in self.jobs and self.jobs[name].spec is not None)
 
     def is_settled(self, name: str) -> bool:
         """Return whether no arm gets a job any more."""
@@ -375,13 +347,11 @@ class JobBook(TimedState[BookRecord]):
 
     def status(self, names: Iterable[str] = ()) -> list[JobStatus]:
         """Return the status of these jobs, without unknown ones; of all jobs if none is named."""
-        wanted = dict.fromkeys(names) or [*self.in_order, *self._unknown, *self.aside]
+        wanted = dict.fromkeys(names) or [*self.in_order, *self._unknown]
         return [
             self.status_of(self.jobs[name])
-            if name in self.jobs
-            else JobStatus(name, "unfinished", reason=reason_of_aside(self.aside[name]))
             for name in wanted
-            if name in self.aside or (name in self.jobs and (name not in self._unknown or self.jobs[name].is_settled))
+            if name in self.jobs and (name not in self._unknown or self.jobs[name].is_settled)
         ]
 
     def status_of(self, entry: JobEntry) -> JobStatus:
@@ -398,8 +368,6 @@ class JobBook(TimedState[BookRecord]):
         time_s = getattr(record, "time_s", self.time_s)
         self.time_s = max(self.time_s, time_s)
         by, changed = self._apply(record)
-        self.unchecked.update(entry.name for entry in changed)
-        self._unnoted |= bool(changed) or isinstance(record, Requested | ShiftEnded)
         offers = record.offers if isinstance(record, Granted) else ()
         changes = [self.note_change(self.status_of(entry), time_s, entry, by, offers) for entry in changed]
         while len(self.settled) > MAX_SETTLED:
@@ -457,10 +425,6 @@ class JobBook(TimedState[BookRecord]):
                 self.epoch, self.succeeds = record.epoch, record.succeeds
             case ClaimNumbered(arm, number):
                 self.numbers[arm] = max(number, self.numbers.get(arm, -1))
-            case JobsQuarantined():
-                self.quarantine(record.jobs)
-            case Checked():
-                self.apply_check(record)
             case BookSnapshot():
                 self._restore(record)
             case Started(name):
@@ -470,8 +434,8 @@ class JobBook(TimedState[BookRecord]):
         return by, changed
 
     def _entry(self, name: str) -> JobEntry | None:
-        """Return the entry of a job, a new one for an unknown name; None if it has left, or its description is lost."""
-        if (entry := self.jobs.get(name)) is None and name not in self.past and name not in self.aside:
+        """Return the entry of a job, a new one for an unknown name; None if it has left."""
+        if (entry := self.jobs.get(name)) is None and name not in self.past:
             entry = self.jobs[name] = JobEntry(name)
             self._unknown[name] = None
             if len(self._unknown) > MAX_UNKNOWN:
@@ -546,8 +510,6 @@ class JobBook(TimedState[BookRecord]):
         entry = self.jobs.get(outcome.job)
         if entry is None and outcome.job in self.past:
             return outcome.outcome == "finished" and self.past.is_given_up(outcome.job)
-        if entry is None and outcome.job in self.aside:
-            return outcome.outcome == "finished"
         if outcome.outcome == "returned":
             if entry is None:
                 return bool(outcome.cycles or outcome.faults)
@@ -567,7 +529,6 @@ class JobBook(TimedState[BookRecord]):
         news, finished = self.is_news(outcome), outcome.outcome == "finished"
         if (entry := self._entry(outcome.job)) is None:
             if finished and news:
-                self.aside.pop(outcome.job, None)
                 self.past.add(outcome.job, finished=True)
             return []
         grant = entry.grants.get(outcome.award)
@@ -613,7 +574,7 @@ class JobBook(TimedState[BookRecord]):
         """Have a job wait again, unless it is abandoned; return what has changed."""
         if entry.spec is not None:  # the last cycle is never assumed done
             entry.cycles = min(entry.cycles, entry.spec.repetitions - 1)
-        if not entry.aside and (lost := self._reason_to_abandon(entry)) is not None:
+        if (lost := self._reason_to_abandon(entry)) is not None:
             return self._set(entry, lost)
         self._move(entry, "waiting", reason)
         return [entry]
@@ -639,12 +600,6 @@ class JobBook(TimedState[BookRecord]):
         action, by = operation.request.action, operation.request.by
         if isinstance(action, Pause | Resume):
             return []
-        if action.job in self.aside:
-            if isinstance(action, Settle):
-                del self.aside[action.job]
-                if action.outcome == "done":
-                    self.past.add(action.job, finished=True)
-            return []
         if (entry := self._entry(action.job)) is None:
             self.operations.forget(action.job)
             return []
@@ -662,7 +617,6 @@ class JobBook(TimedState[BookRecord]):
                 self._move(entry, entry.state, reason)
                 return [entry]
         elif isinstance(action, Settle) and entry.state == "unfinished":
-            entry.aside = ""
             if action.outcome == "redo":
                 return self._redo(entry)
             cycles = entry.cycles if entry.spec is None else entry.spec.repetitions
@@ -749,11 +703,7 @@ class JobBook(TimedState[BookRecord]):
 
     def _move(self, entry: JobEntry, state: JobState, reason: str = "") -> None:
         """Change the state of a job."""
-        if state == "finished":
-            entry.aside = ""
-        elif entry.aside:
-            state, reason = "unfinished", reason_of_aside(entry.aside)
-        elif state == "waiting" and self.ended:
+        if state == "waiting" and self.ended:
             known = entry.reason if entry.state == "unfinished" else reason
             state, reason = "unfinished", known or SHIFT_ENDED
         self.waiting.pop(entry.name, None)
@@ -828,39 +778,6 @@ class JobBook(TimedState[BookRecord]):
         self.recent.append(change)
         return change
 
-    # Journals that are wrong
-
-    def quarantined(self) -> list[str]:
-        """Return the names of the quarantined jobs."""
-        return [*self.aside, *(name for name, entry in self.jobs.items() if entry.aside)]
-
-    def quarantine(self, reasons: Mapping[str, str]) -> None:
-        """Have no arm do these jobs until a person has settled them, except for one that may have it already.
-
-        As it is unknown where that arm is, every arm may be anywhere until it says where it is.
-        """
-        for name, reason in reasons.items():
-            if (entry := self.jobs.get(name)) is None:
-                if name not in self.past:
-                    self.aside.setdefault(name, reason)
-            else:
-                entry.aside = entry.aside or reason
-                self._outcomes ^= _outcome_hash(entry.outcome)
-                entry.outcome = None
-                if (grant := entry.grant) is not None:
-                    grant.may_commit = grant.silent = True
-                self._move(entry, "unfinished")
-        if reasons:
-            self.space = dict.fromkeys([*self.arms, *self.space], frozenset([ANYWHERE]))
-
-    def apply_check(self, check: Checked) -> None:
-        """Take over the numbers of a check."""
-        self.unchecked.clear()
-        self._unnoted = False
-        if check.number > self.checks:
-            self.checks = check.number
-            self.number, self.operated = max(self.number, check.changes), max(self.operated, check.operated)
-
     def _restore(self, snapshot: BookSnapshot) -> None:
         for name in PLAIN:
             setattr(self, name, getattr(snapshot, name))
@@ -884,17 +801,3 @@ class JobBook(TimedState[BookRecord]):
             self.operations.add(operation)
         self.operations.names = dict(snapshot.names)
         self.requested = deque(snapshot.requested, maxlen=MAX_RECENT)
-        self.aside, self._unnoted = dict(snapshot.aside), False
-        self.unchecked.clear()
-        at_work = [entry for entry in entries if entry.state in ("awarded", "finishing") and entry.grant is None]
-        self.quarantine({entry.name: f"it is {entry.state} without an award" for entry in at_work})
-
-
-def digest(book: JobBook, name: str) -> int:
-    """Return a checksum of the state of a job, and of the award that it has."""
-    entry = book.jobs[name]
-    grant = entry.grants.get(entry.award)
-    terms = None if grant is None else (entry.award, grant.record.arm, grant.record.plan, grant.record.space)
-    cancelled = book.operations.cancelled(name) is not None
-    state = (entry.state, entry.cycles, cancelled, sorted(entry.faults.items()), terms)
-    return crc32(msgspec.json.encode(state), crc32(encode(entry.spec) if entry.spec else b""))

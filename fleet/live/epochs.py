@@ -111,7 +111,7 @@ def adopted(book: JobBook, history: History) -> list[BookRecord]:
 
     def is_open(job: JobSpec) -> bool:
         if (entry := book.jobs.get(job.name)) is None:
-            return job.name not in book.past and job.name not in book.aside
+            return job.name not in book.past
         return entry.state == "waiting" and (entry.spec is None or is_same_work(entry.spec, job))
 
     unknown = tuple(job for job in history.finished if is_open(job))

@@ -125,7 +125,6 @@ def admit(
     ended: bool = False,
     given_up: Container[str] = (),
     past: PastJobs | None = None,
-    aside: Mapping[str, str] = NONE,
 ) -> tuple[Admission, ...]:
     """Return which jobs of one submission can be accepted; they may name one another as predecessors in any order.
 
@@ -137,7 +136,6 @@ def admit(
         ended: Whether the shift is over.
         given_up: Known jobs that are given up: a job that waits for one is accepted, and given up too.
         past: Jobs that were settled long ago; they are known, too.
-        aside: Why jobs are quarantined of which only the name is known: none of that name is accepted.
     """
     past = past or PastJobs()
     count = len(known) if count is None else count
@@ -152,8 +150,6 @@ def admit(
             continue
         elif same_name is not None or job.name in past:
             rejected[index] = f"Another job has the name '{job.name}'; names must be unique."
-        elif job.name in aside:
-            rejected[index] = f"A job '{job.name}' is quarantined, and may have been done: settle it first."
         elif unknown:
             rejected[index] = f"No place '{unknown[0]}' in this cell. Places: {', '.join(sorted(places or ()))}."
         elif count + len(new) >= limit:

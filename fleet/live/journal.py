@@ -1,29 +1,28 @@
-"""Append-only journal: records are durable before they take effect.
+"""Journal of one participant: records are durable before they take effect.
 
-Each line is one `append`: `{"crc":"0a1b2c3d","records":[…]}`, with the CRC-32 of the encoded records. A line is
-complete or absent: an unfinished last line was torn by a crash before `append` returned, and is removed on opening. Any
-other line whose checksum differs is damage, and the journal refuses to open.
+A table of an SQLite database: each row is one `append`, the records as a JSON array, with a CRC-32 of all rows so far,
+so that a changed, missing or repeated row is noticed. With a write-ahead log and `synchronous = FULL` an append is on
+disk, or is not there after a crash (https://sqlite.org/wal.html). A damaged journal does not open.
 
 Journals of arms and auctioneers share the record types in this file; each adds its own. Times are fleet seconds, 0 for
 unknown. A journal is compacted when it has grown.
 """
 
 import errno
-import fcntl
 import logging
 import os
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import UnionType
-from typing import Any, Generic, Literal, Self, TypeVar, cast
+from typing import Any, Generic, Literal, NamedTuple, Protocol, Self, TypeVar, cast
 
+import apsw
 import msgspec
 
 from fleet.bus.protocol.auction import Count, JobSpec, Name
 from fleet.errors import JournalError, JournalFull, printable
-from fleet.files import atomic_path
 
 _LOG = logging.getLogger(__name__)
 
@@ -31,18 +30,11 @@ COMPACT_FACTOR, COMPACT_BYTES = 4, 1_000_000
 """A journal needs compaction once it has grown by this factor since the last one, and to this size."""
 
 Record = TypeVar("Record", bound=msgspec.Struct)
-Quarantine = Callable[[bytes, str], object]
-"""Quarantines a record that cannot be applied, with the reason."""
-Salvage = Callable[[bytes, str], Sequence[Record]]
-"""Quarantines an unreadable record, with the reason, and returns its replacement."""
 
 _REMEDY = (
     "Restore a copy. Without its journal a participant has lost its jobs, and may do them twice: see Epochs in "
     "docs/bus/auctioneer.md before you move the file away."
 )
-_HEAD, _MIDDLE, _TAIL = b'{"crc":"', b'","records":', b"}\n"
-_CRC_END = len(_HEAD) + 8
-_START = _CRC_END + len(_MIDDLE)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -57,19 +49,10 @@ class JournalState(ABC, Generic[Record]):
     def compact(self) -> tuple[Record, ...]:
         """Return the fewest records that give the same state."""
 
-    def replay(self, records: Iterable[Record], quarantine: Quarantine | None = None) -> Self:
-        """Apply records, oldest first, and return the state.
-
-        Args:
-            quarantine: Quarantines each record that cannot be applied; None: such a record is an error.
-        """
+    def replay(self, records: Iterable[Record]) -> Self:
+        """Apply records, oldest first, and return the state."""
         for record in records:
-            try:
-                self.apply(record)
-            except (KeyError, ValueError, msgspec.ValidationError) as error:
-                if quarantine is None:
-                    raise
-                quarantine(msgspec.json.encode(record), str(error))
+            self.apply(record)
         return self
 
 
@@ -79,69 +62,73 @@ class TimedState(JournalState[Record]):
     time_s: float
     """Latest time of all records."""
 
-    def checks_due(self) -> tuple[Record, ...]:
-        """Return records to write before the next ones, by which a replay can check those before."""
-        return ()
+
+class _Database(Protocol):
+    """What is used of `apsw.Connection`, with types that need no `Buffer`, which Python 3.11 lacks."""
+
+    @property
+    def system_errno(self) -> int: ...
+    def execute(self, statement: str, values: tuple[int | str, ...] = ()) -> Iterator[tuple[int, str, int]]: ...
+    def pragma(self, name: str, value: str) -> object: ...
+    def close(self) -> None: ...
+    def __enter__(self) -> object: ...
+    def __exit__(self, *exc: Any) -> bool | None: ...
+
+
+class _End(NamedTuple):
+    """The last row of a journal: its number, the checksum up to it, and the bytes of all records."""
+
+    row: int = 0
+    crc: int = 0
+    size: int = 0
+
+    def after(self, line: bytes) -> "_End":
+        """Return the end after one more row."""
+        return _End(self.row + 1, zlib.crc32(line, self.crc), self.size + len(line))
 
 
 class Journal(Generic[Record]):
     """`with Journal(path, Opened | Closed) as journal:` keeps the file open, for this process alone.
 
     Attributes:
-        path: The file.
-        torn: Bytes of an unfinished last line that were removed on opening.
-        quarantine: Quarantines records that cannot be applied.
+        path: The file; the log beside it, with the same name and `-wal`, is a part of it.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        kind: type[Record] | UnionType,
-        *,
-        sync: Callable[[int], None] = os.fsync,
-        quarantine: Salvage[Record] | None = None,
-    ) -> None:
+    def __init__(self, path: Path, kind: type[Record] | UnionType, *, durable: bool = True) -> None:
         """Prepare a journal of records of one `msgspec.Struct`, or of a union of tagged ones.
 
         Args:
-            sync: Writes an open file through to the disk.
-            quarantine: Quarantines each undamaged record of another version, with the reason; `records` yields its
-                replacement. None: the journal refuses to open.
+            durable: False: a loss of power may lose records.
         """
         self.path = path
-        self.torn = 0
         self._decoder = msgspec.json.Decoder(cast(type[list[Record]], list[kind]))
-        self._encoder = msgspec.json.Encoder()
-        self._sync, self.quarantine = sync, quarantine
-        self._file = self._lock = -1
-        self._end = self._compacted = 0
+        self._durable = durable
+        self._db: _Database | None = None
+        self._end, self._compacted = _End(), 0
         self._broken = ""
 
     def open(self) -> Self:
-        """Open and lock the file, create it if it is missing, and check every line.
+        """Open and lock the file, create it if it is missing, and check every row.
 
         Raises:
             JournalError: another process has it open, it is damaged, or it cannot be created.
         """
-        if self._file >= 0:
+        if self._db is not None:
             return self
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._lock = self._lock_file()
-            fresh = not self.path.exists()
-            self._file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
-            if fresh:
-                self._sync_folder()
-            self._end = sum(len(line) for line, _ in self._lines(_ignore if self.quarantine else None))
-            self.torn = os.fstat(self._file).st_size - self._end
-            if self.torn:
-                _LOG.warning("%s: removed an unfinished last line (%d bytes).", self.path, self.torn)
-                os.ftruncate(self._file, self._end)
-                self._sync(self._file)
-        except OSError as error:
+            self.path.touch(mode=0o600)  # SQLite gives its log the same mode
+            self._db = cast(_Database, apsw.Connection(str(self.path)))
+            self._db.pragma("locking_mode", "exclusive")
+            self._db.pragma("journal_mode", "wal")
+            self._db.pragma("synchronous", "full" if self._durable else "off")
+            self._db.execute("CREATE TABLE IF NOT EXISTS journal (row INTEGER PRIMARY KEY, records TEXT, crc INTEGER)")
+            for _ in self.records():
+                pass
+        except (OSError, apsw.Error) as error:
+            failure = self._failure(error, "opened")
             self.close()
-            kind = JournalFull if error.errno in _FULL else JournalError
-            raise kind(f"Journal '{self.path}' cannot be opened: {error.strerror}.") from error
+            raise failure from error
         except JournalError:
             self.close()
             raise
@@ -149,10 +136,9 @@ class Journal(Generic[Record]):
 
     def close(self) -> None:
         """Close and unlock the file; a second call does nothing."""
-        for handle in (self._file, self._lock):
-            if handle >= 0:
-                os.close(handle)
-        self._file = self._lock = -1
+        if self._db is not None:
+            self._db.close()
+            self._db = None
 
     def __enter__(self) -> Self:
         return self.open()
@@ -164,176 +150,93 @@ class Journal(Generic[Record]):
         """Yield all records, oldest first.
 
         Raises:
-            JournalError: the file was damaged while it was open.
+            JournalError: it is damaged, or of another version.
         """
-        for _, records in self._lines(self.quarantine):
-            yield from records
+        end = _End()
+        for row, content, crc in self._opened().execute("SELECT row, records, crc FROM journal ORDER BY row"):
+            line = content.encode()
+            end = end.after(line)
+            if (row, crc) != (end.row, end.crc):
+                raise JournalError(f"{self.path}, row {end.row}: damaged (wrong checksum). {_REMEDY}")
+            try:
+                yield from self._decoder.decode(line)
+            except (msgspec.DecodeError, RecursionError) as error:
+                raise JournalError(f"{self.path}, row {row}: not of this version ({error}). {_REMEDY}") from error
+        self._end = end
 
     def append(self, *records: Record) -> None:
         """Write records and return when they are durable: all of them or, if it raises, none.
 
         Raises:
-            JournalFull: no space on the disk; the file is unchanged.
+            JournalFull: no space on the disk; the journal is unchanged.
             JournalError: the disk failed and the content of the file is uncertain; further writes are refused.
         """
-        if self._broken:
-            raise JournalError(self._broken)
-        if not records:
-            return
-        line = self._encode(records)
-        try:
-            self._write(self._opened(), line)
-        except OSError as error:
-            self._undo_append(error)
-        self._end += len(line)
+        if records:
+            self._write(records)
 
     def rewrite(self, *records: Record) -> None:
-        """Replace the whole content by these records; after a crash the file is the old one or the new one.
+        """Replace the whole content by these records; after a crash it is the old one or the new one.
 
         Raises:
-            JournalFull: no space on the disk; the file is unchanged.
-            JournalError: the disk failed; the file is unchanged, or it is the new one and must be reopened.
+            JournalError: as `append`.
         """
-        line = self._encode(records) if records else b""
-        file = -1
-        try:
-            self._opened()
-            with atomic_path(self.path) as draft:
-                file = os.open(draft, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC, 0o600)
-                self._write(file, line)
-        except OSError as error:
-            if file >= 0:
-                os.close(file)
-            raise self._failure(error) from error
-        # The old file has no name any more: what is written there would be lost.
-        os.close(self._file)
-        self._file, self._end, self._broken = file, len(line), ""
-        try:
-            self._sync_folder()
-        except OSError as error:
-            self._broken = f"{self._failure(error)} No further writes until it is reopened."
-            raise JournalError(self._broken) from error
+        self._write(records, replace=True)
 
     @property
     def needs_compaction(self) -> bool:
-        """Whether the file has grown enough since the last compaction."""
-        return self._end > max(COMPACT_BYTES, COMPACT_FACTOR * self._compacted)
+        """Whether it has grown enough since the last compaction."""
+        return self._end.size > max(COMPACT_BYTES, COMPACT_FACTOR * self._compacted)
 
     def compact(self, *records: Record) -> None:
-        """Replace all records by fewer that give the same state; a full disk leaves the file unchanged.
+        """Replace all records by fewer that give the same state; a full disk leaves the journal unchanged.
 
         Raises:
-            JournalError: as `rewrite`.
+            JournalError: as `append`.
         """
         try:
             self.rewrite(*records)
         except JournalFull as error:
             _LOG.warning("The journal is not compacted: %s", error)
-        self._compacted = self._end
+        self._compacted = self._end.size
 
     # Inside
 
-    def _opened(self) -> int:
-        if self._file < 0:
+    def _opened(self) -> _Database:
+        if self._db is None:
             raise JournalError(f"Journal '{self.path}' is not open.")
-        return self._file
+        return self._db
 
-    def _lock_file(self) -> int:
-        """Lock that the system releases when this process exits."""
-        path = self.path.with_name(f"{self.path.name}.lock")
-        lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    def _write(self, records: tuple[Record, ...], *, replace: bool = False) -> None:
+        if self._broken:
+            raise JournalError(self._broken)
+        db, line = self._opened(), msgspec.json.encode(records)
+        end = (_End() if replace else self._end).after(line)
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            os.close(lock)
-            raise JournalError(
+            with db:
+                if replace:
+                    db.execute("DELETE FROM journal")
+                db.execute("INSERT INTO journal VALUES (?, ?, ?)", (end.row, line.decode(), end.crc))
+        except apsw.Error as error:
+            failure = self._failure(error, "written")
+            if not isinstance(failure, JournalFull):
+                # After a failed fsync the page cache may differ from the disk.
+                self._broken = f"{failure} No further writes until it is reopened."
+                failure = JournalError(self._broken)
+            raise failure from error
+        self._end = end
+
+    def _failure(self, error: OSError | apsw.Error, tried: str) -> JournalError:
+        number = error.errno if isinstance(error, OSError) else 0 if self._db is None else self._db.system_errno
+        if isinstance(error, apsw.FullError) or number in _FULL:
+            return JournalFull(f"Journal '{self.path}' cannot be {tried}: no space left on the disk.")
+        if isinstance(error, apsw.BusyError):
+            return JournalError(
                 f"Journal '{self.path}' is in use by another process. Stop that process, or choose another folder."
-            ) from error
-        return lock
-
-    def _encode(self, records: tuple[Record, ...]) -> bytes:
-        body = self._encoder.encode(records)
-        return b"".join((_HEAD, b"%08x" % zlib.crc32(body), _MIDDLE, body, _TAIL))
-
-    def _lines(self, quarantine: Salvage[Record] | None) -> Iterator[tuple[bytes, list[Record]]]:
-        """Yield every complete line with its records."""
-        with open(os.dup(self._opened()), "rb") as file:
-            file.seek(0)
-            for number, line in enumerate(file, start=1):
-                if line.endswith(b"\n"):
-                    yield line, self._decode(line, number, quarantine)
-
-    def _decode(self, line: bytes, number: int, quarantine: Salvage[Record] | None) -> list[Record]:
-        body = line[_START : -len(_TAIL)]
-        complete = line.startswith(_HEAD) and line[_CRC_END:_START] == _MIDDLE and line.endswith(_TAIL)
-        if not complete or line[len(_HEAD) : _CRC_END] != b"%08x" % zlib.crc32(body):
-            raise JournalError(
-                f"{self.path}, line {number}: damaged (wrong checksum), so its records are lost. {_REMEDY}"
             )
-        try:
-            return self._decoder.decode(body)
-        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-            if quarantine is not None and (records := self._some_of(body, quarantine)) is not None:
-                return records
-            raise JournalError(
-                f"{self.path}, line {number}: not a record of this version ({error}). {_REMEDY}"
-            ) from error
-
-    def _some_of(self, body: bytes, quarantine: Salvage[Record]) -> list[Record] | None:
-        """Decode records one by one; None if it is no list."""
-        try:
-            raws = msgspec.json.decode(body, type=list[msgspec.Raw])
-        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-            return None
-        records: list[Record] = []
-        for raw in raws:
-            try:
-                records += self._decoder.decode(b"[" + bytes(raw) + b"]")
-            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-                records += quarantine(bytes(raw), str(error))
-        return records
-
-    def _write(self, file: int, line: bytes) -> None:
-        """Write a line through to the disk."""
-        rest = memoryview(line)
-        while rest:  # each call writes some bytes or raises
-            rest = rest[os.write(file, rest) :]
-        self._sync(file)
-
-    def _undo_append(self, error: OSError) -> None:
-        """Remove a line that could not be written.
-
-        Raises:
-            JournalError: always.
-        """
-        failure = self._failure(error)
-        if not isinstance(failure, JournalFull):
-            # After a failed fsync the page cache may differ from the disk.
-            self._broken = f"{failure} No further writes until it is reopened."
-        try:
-            os.ftruncate(self._file, self._end)
-            self._sync(self._file)
-        except OSError as worse:
-            self._broken = f"Journal '{self.path}' could not be restored ({worse.strerror}); it must be reopened."
-        raise failure from error
-
-    def _failure(self, error: OSError) -> JournalError:
-        if error.errno in _FULL:
-            return JournalFull(f"Journal '{self.path}': no space left to write ({error.strerror}).")
-        return JournalError(f"Journal '{self.path}' cannot be written: {error.strerror}.")
-
-    def _sync_folder(self) -> None:
-        """Write the folder through to the disk: only then is the name of a new file safe."""
-        folder = os.open(self.path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            self._sync(folder)
-        finally:
-            os.close(folder)
-
-
-def _ignore(record: bytes, reason: str) -> tuple[()]:
-    """Leave a record out."""
-    return ()
+        if isinstance(error, apsw.NotADBError | apsw.CorruptError):
+            return JournalError(f"Journal '{self.path}' is damaged, or of another version ({error}). {_REMEDY}")
+        why = error.strerror if isinstance(error, OSError) else os.strerror(number) if number else str(error)
+        return JournalError(f"Journal '{self.path}' cannot be {tried}: {why}.")
 
 
 class Started(msgspec.Struct, frozen=True, tag="started"):
@@ -420,31 +323,6 @@ TICK_S = 2.0
 """Real seconds between two records of the fleet's time."""
 
 
-def quarantine(path: Path, name: str) -> Callable[[bytes, str], tuple[()]]:
-    """Return a function that quarantines a journal record: it appends the record to a file, and logs the reason.
-
-    Args:
-        path: The file.
-        name: Of the arm or auctioneer.
-    """
-
-    def put(record: bytes, reason: str) -> tuple[()]:
-        begin = printable(record[:200].decode(errors="replace"))
-        _LOG.error("'%s': quarantined a journal record in '%s': %s. It begins %s.", name, path, reason, begin)
-        try:
-            with path.open("ab") as file:
-                file.write(record + b"\n")
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError as error:
-            raise JournalError(
-                f"A record cannot be quarantined in '{path}': {error.strerror}. Free space there."
-            ) from error
-        return ()
-
-    return put
-
-
 def own_records(journal: Journal[Record], name: str) -> Iterator[Record]:
     """Yield the records of the journal of an arm or auctioneer, oldest first.
 
@@ -505,13 +383,11 @@ class TimeRecorder:
         if real_s < self._recorded_s + TICK_S:
             return
         self._recorded_s = real_s
-        records = (*self._state.checks_due(), ClockTick(time_s))
         try:
-            self._journal.append(*records)
+            self._journal.append(ClockTick(time_s))
         except JournalFull as error:
             _LOG.error("Could not record the fleet's time: %s", error)
         else:
-            for record in records:
-                self._state.apply(record)
+            self._state.apply(ClockTick(time_s))
         if self._journal.needs_compaction:
             self._journal.compact(*self._state.compact())

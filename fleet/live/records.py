@@ -1,11 +1,7 @@
-"""Journal records of a job book, the entries that a snapshot of it holds, and operator requests by what they set.
-
-A record that cannot be read is quarantined, and its other jobs are kept (`salvage`).
-"""
+"""Journal records of a job book, the entries that a snapshot of it holds, and operator requests by what they set."""
 
 import math
 from dataclasses import dataclass, field
-from typing import cast
 
 import msgspec
 from msgspec.structs import replace
@@ -14,7 +10,6 @@ from fleet.bus.protocol.auction import ABANDONED, Award, JobSpec, JobState, Name
 from fleet.bus.protocol.consensus import Faults, JobOutcome
 from fleet.bus.protocol.messages import Count
 from fleet.bus.protocol.operator import ALL_ARMS, Cancel, Change, ControlRequest, Operation, Pause, Resume, Settle
-from fleet.errors import JournalError
 from fleet.live.job_rules import MAX_OPEN_JOBS, changed_spec, content_hash, hash_of
 from fleet.live.journal import (
     ClockTick,
@@ -22,9 +17,7 @@ from fleet.live.journal import (
     EpochBegun,
     JobsAccepted,
     Progress,
-    Quarantine,
     Released,
-    Salvage,
     SpaceCleared,
     SpaceTaken,
     Started,
@@ -32,7 +25,7 @@ from fleet.live.journal import (
 from fleet.live.space import ANYWHERE
 
 MAX_REASON = 300
-"""Characters of the reason for which a job is quarantined."""
+"""Characters of the reason why a job was returned or refused."""
 MAX_REQUESTS = 1_024
 """Requests of people whose names are kept."""
 MAX_SLOTS = 4 * MAX_OPEN_JOBS
@@ -137,28 +130,6 @@ class Requested(msgspec.Struct, frozen=True, tag="requested"):
         return self.operation.time_s
 
 
-class Checked(msgspec.Struct, frozen=True, tag="checked"):
-    """What the records since the last one of these have changed, so that a wrong or missing one is noticed."""
-
-    number: int
-    """Counts them, from 1."""
-    changes: int
-    """Number of the next change."""
-    operated: int
-    """Number of the next request of a person."""
-    jobs: dict[str, int]
-    """Checksum of the state of each job that has changed."""
-    time_s: float
-    paused: dict[str, str] = {}
-
-
-class JobsQuarantined(msgspec.Struct, frozen=True, tag="jobs_quarantined"):
-    """Jobs whose records cannot be read, with the reason."""
-
-    jobs: dict[str, str]
-    time_s: float = 0.0
-
-
 class Grant(msgspec.Struct):
     """A grant of a job, open or ended."""
 
@@ -200,9 +171,6 @@ class JobEntry(msgspec.Struct):
     """The arm of each fault in this job, by award."""
     settled_s: float | None = None
     """Fleet time at which it was finished or given up."""
-    aside: str = ""
-    """Why it is quarantined; "" if it is not. It stays unfinished until an arm reports it finished, or a person settles
-    it."""
 
     @property
     def original(self) -> JobSpec | None:
@@ -250,8 +218,6 @@ class BookSnapshot(msgspec.Struct, frozen=True, tag="book_snapshot"):
     epoch: str
     succeeds: bool
     numbers: dict[str, int]
-    aside: dict[str, str]
-    checks: int
     names: dict[str, int]
     """Of requests of people, as in `Operations`."""
     operations: tuple[Operation, ...]
@@ -263,10 +229,8 @@ BookRecord = (
     Started
     | EpochBegun
     | ClockTick
-    | Checked
     | BookSnapshot
     | JobsAccepted
-    | JobsQuarantined
     | HistoryAdopted
     | Granted
     | CommitPermitted
@@ -444,73 +408,3 @@ class CountedLease:
     """The award, until its arm answers."""
     sent_s: float = -math.inf
     attempts: int = 1
-
-
-# Records that cannot be read
-
-
-def salvage(quarantine: Quarantine) -> Salvage[BookRecord]:
-    """Return what to do with a record that cannot be read: put it aside, and go on with its other jobs."""
-
-    def put(record: bytes, reason: str) -> list[BookRecord]:
-        quarantine(record, reason)
-        return rest_of(record, reason)
-
-    return put
-
-
-def rest_of(raw: bytes, reason: str) -> list[BookRecord]:
-    """Return what can be kept of a record that is none of this version: its other jobs, and whom it concerns.
-
-    Raises:
-        JournalError: it is the record of all jobs, and cannot be read at all.
-    """
-    try:
-        content = msgspec.json.decode(raw)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        return []
-    if not isinstance(content, dict):
-        return []
-    fields, bad = cast(dict[str, object], content), set[str]()
-    snapshot = fields.get("type") == "book_snapshot"
-    parts: dict[str, type[msgspec.Struct]] = {"jobs": JobEntry if snapshot else JobSpec, "finished": JobSpec}
-    for key, kind in (parts | {"recent": Result}).items():
-        if isinstance(items := fields.get(key), list):
-            kept: list[object] = []
-            for item in cast(list[object], items):
-                if _is_readable(item, kind):
-                    kept.append(item)
-                elif kind is not Result:  # of the last messages none is needed
-                    bad.add(_job_in(item))
-            fields[key] = kept
-    rest: list[BookRecord] = []
-    try:
-        rest.append(msgspec.convert(fields, BookRecord, str_keys=True))
-    except msgspec.ValidationError as error:
-        if snapshot:
-            raise JournalError(f"The journal's record of all jobs cannot be read: {error}.") from error
-        bad.add(_job_in(fields))
-    bad.discard("")
-    return [*rest, JobsQuarantined(dict.fromkeys(sorted(bad), reason[:MAX_REASON]))] if bad else rest
-
-
-def _is_readable(item: object, kind: type[msgspec.Struct]) -> bool:
-    try:
-        msgspec.convert(item, kind)
-    except msgspec.ValidationError:
-        return False
-    return True
-
-
-def _job_in(item: object) -> str:
-    """Return the name of the job that a part of a record is about; "" if there is none."""
-    if not isinstance(item, dict):
-        return ""
-    fields = cast(dict[str, object], item)
-    for key in ("name", "job"):
-        if isinstance(name := fields.get(key), str):
-            return name
-    if isinstance(award := fields.get("award"), str) and job_of(award):
-        return job_of(award)
-    inner = ("spec", "record", "settled", "operation", "request", "action")
-    return next(filter(None, (_job_in(fields.get(key)) for key in inner)), "")

@@ -100,10 +100,6 @@ def _objection_to_job(book: JobBook, action: Cancel | Settle | Change) -> str:
     if entry is None or (entry.spec is None and not entry.is_settled):
         if action.job in book.past:
             return "It was settled long ago."
-        if action.job in book.aside:
-            if isinstance(action, Settle):
-                return ""
-            raise Refused(f"'{action.job}' is quarantined, and its description is lost: settle it as done or redo.")
         raise Refused(f"There is no job '{action.job}'.")
     state = entry.state
     match action:

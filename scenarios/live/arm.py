@@ -29,8 +29,8 @@ from fleet.live.arm.node import ArmConfig, ArmNode, AuctioneerClient, WorkSource
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
-from fleet.live.journal import CompactingJournal, Journal, own_records, quarantine
-from fleet.live.records import BookRecord, salvage
+from fleet.live.journal import CompactingJournal, Journal, own_records
+from fleet.live.records import BookRecord
 from fleet.live.supervisor import return_memory
 from fleet.motion import Plan
 from scenarios.live.auctioneer import folder_of, live_fleet, refuse_other_way, scenario_jobs, summary
@@ -96,13 +96,10 @@ def run_arm(
     with progress_bar() as progress:
         simulated = partial(simulated_arm, scenario, name, spec.difficulty, spec.seed, progress, risk=spec.risk)
         arm = replayed_arm(name, file, twin, network) if file else simulated()
-    # A quarantined award is not executed again: its lease expires at the auctioneer, which awards the job again or, if
-    # it had permitted the last cycle, marks it unfinished.
-    aside = quarantine(folder / f"{name}.aside", name)
     with (
         until_stopped() as stop,
         BusClient(endpoint, fleet, stopped=stop.is_set) as link,
-        Journal[ArmRecord](folder / f"{name}.journal", ArmRecord, quarantine=aside) as book,
+        Journal[ArmRecord](folder / f"{name}.journal", ArmRecord) as book,
         ExitStack() as resources,
     ):
         wait_for_name(link, name)
@@ -110,8 +107,7 @@ def run_arm(
         if alone:
             refuse_auctioneer(link)
             membership = membership_of(scenario, name, spec.policy, jobs=spec.jobs, seed=spec.seed)
-            grants = Journal[BookRecord](folder / f"{name}.grants", BookRecord, quarantine=salvage(aside))
-            resources.enter_context(grants)
+            grants = resources.enter_context(Journal[BookRecord](folder / f"{name}.grants", BookRecord))
             source = partial(ConsensusNode, membership=membership, journal=grants, new_epoch=spec.new_epoch)
 
         node = make_node(link, book, arm, scenario, speed=speed, rate_hz=rate_hz, capacity=capacity, work_source=source)
@@ -298,7 +294,7 @@ def make_node(
 
 def restart_history(book: Journal[ArmRecord], name: str, time_s: float) -> ArmHistory:
     """History of the arm at this start, written to its journal."""
-    before = ArmHistory().replay(own_records(book, name), book.quarantine)
+    before = ArmHistory().replay(own_records(book, name))
     for active in before.active.values():
         log.warning("'%s' was unfinished at the last exit of the arm: returned.", active.job)
     history = before.after_restart(name, time_s)

@@ -19,9 +19,9 @@ from fleet.job import Job
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.rounds import Allocate, Assignment, Bidding, resolve_claims
-from fleet.live.journal import Journal, quarantine
+from fleet.live.journal import Journal
 from fleet.live.leases import Timing
-from fleet.live.records import BookRecord, salvage
+from fleet.live.records import BookRecord
 from fleet.live.supervisor import return_memory
 from scenarios.live.cell import cell_of
 from scenarios.policy_loader import ON_BUS, OnBus, policy_at, scope_of, without_simulator
@@ -122,11 +122,10 @@ def run_auctioneer(scenario: Scenario, name: str, spec: LiveSpec, endpoint: str)
     refuse_other_way(folder, (arm.name for arm in scenario.arms), alone=False)
     with progress_bar() as progress:
         cell, excludes = cell_of(scenario, name, progress)
-    aside = salvage(quarantine(folder / f"{name}.aside", name))
     with (
         until_stopped() as stop,
         BusClient(endpoint, fleet, stopped=stop.is_set) as link,
-        Journal[BookRecord](folder / f"{name}.journal", BookRecord, quarantine=aside) as book,
+        Journal[BookRecord](folder / f"{name}.journal", BookRecord) as book,
     ):
         places = frozenset(place.name for place in scenario.places)
         timing = Timing(max_jobs=scenario.slots)

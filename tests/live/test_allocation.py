@@ -94,10 +94,10 @@ def test_the_job_of_an_offline_arm_goes_to_another_after_the_lease(fleet_of, alo
 def test_the_job_of_a_killed_arm_is_returned_with_its_cycles(fleet):
     fleet.submit(job("a", 30))
     fleet.until(lambda: fleet.status("a").cycles > 3)
-    arm, cycles = fleet.holder("a"), fleet.status("a").cycles
-    fleet.restart(arm)
-    fleet.until(lambda: fleet.status("a").state == "waiting")
-    assert fleet.status("a").cycles >= cycles
+    before = fleet.status("a")
+    fleet.restart(before.arm)
+    fleet.until(lambda: fleet.status("a").award != before.award)
+    assert fleet.status("a").cycles >= before.cycles
     fleet.until(lambda: fleet.is_everywhere("a", "finished"))
 
 

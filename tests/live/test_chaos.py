@@ -39,14 +39,13 @@ def test_jobs_are_counted_that_a_journal_has_left_out(tmp_path):
     files = JournalFiles(tmp_path)
     with Journal[ArmRecord](tmp_path / "a.journal", ArmRecord) as journal:
         close(journal, "1", "j")
-        files.follow()
+        files.follow(0.0)
         journal.rewrite(*ArmHistory().replay(journal.records()).compact())  # as at a start: the report is repeated
-        files.follow()
+        files.follow(0.0)
         journal.rewrite()
         close(journal, "2", "j")
         close(journal, "3", "k")
         assert files.count_finished() == {"j": 2, "k": 1}
-    files.close()
 
 
 @pytest.mark.ci_slow

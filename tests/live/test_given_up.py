@@ -10,7 +10,6 @@ from fleet.bus.protocol.consensus import Claim, ClaimEntry, JobOutcome
 from fleet.job import reason_to_give_up
 from fleet.live.book import MAX_SETTLED, JobBook
 from fleet.live.consensus.grants import Granter
-from fleet.live.doubts import replay
 from fleet.live.journal import JobsAccepted
 from fleet.live.leases import expire
 from fleet.live.records import BookRecord, Granted
@@ -47,7 +46,7 @@ def end(number: int, arm: str, outcome: str, time_s: float, cycles: int = 0, *, 
 def test_the_auctioneer_gives_a_job_up_at_that_fault_and_no_other_event(attempts):
     """Against a list of faults; a replay of the journal, and of its snapshot, gives the same."""
     written: list[BookRecord] = [JobsAccepted((JOB, NEXT), "test", 0.0)]
-    book, faults = replay(JobBook(), written), list[str]()
+    book, faults = JobBook().replay(written), list[str]()
     for number, (arm, end) in enumerate(attempts, start=1):
         if too_often(faults):
             break
@@ -61,7 +60,7 @@ def test_the_auctioneer_gives_a_job_up_at_that_fault_and_no_other_event(attempts
         for record in records:
             book.apply(record)
         faults += [arm] if end == "faulted" else []
-    for ledger in (book, replay(JobBook(), written), replay(JobBook(), book.compact())):
+    for ledger in (book, JobBook().replay(written), JobBook().replay(book.compact())):
         (status,) = ledger.status(["j"])
         assert status.state == ("given_up" if too_often(faults) else "waiting")
         if too_often(faults):
@@ -73,7 +72,7 @@ def test_the_auctioneer_gives_a_job_up_at_that_fault_and_no_other_event(attempts
 
 
 def test_faults_of_lost_arms_count_when_they_are_reported_late():
-    book = replay(JobBook(), [JobsAccepted((JOB,), "test", 0.0)])
+    book = JobBook().replay([JobsAccepted((JOB,), "test", 0.0)])
     for number in (1, 2):
         book.apply(award(number, "a"))
         book.apply(end(number, "a", "dropped", float(number)))
@@ -87,7 +86,7 @@ def test_faults_of_lost_arms_count_when_they_are_reported_late():
 
 def test_jobs_that_wait_for_a_job_that_is_given_up_are_given_up_until_that_one_is_finished():
     last = JobSpec(name="a", kind="hold", places=("x",), after=("k",))  # sorted before the others
-    book = replay(JobBook(), [JobsAccepted((JOB, NEXT), "test", 0.0)])
+    book = JobBook().replay([JobsAccepted((JOB, NEXT), "test", 0.0)])
     for number in (1, 2):
         book.apply(award(number, "a"))
         changes = book.apply(end(number, "a", "returned", float(number), faulted=True))
@@ -96,7 +95,7 @@ def test_jobs_that_wait_for_a_job_that_is_given_up_are_given_up_until_that_one_i
     assert (admission.accepted, admission.reason) == (True, LOST.replace("'j'", "'k'"))
     (change,) = book.apply(JobsAccepted((last,), "test", 3.0))
     assert (change.status.state, change.status.reason) == ("given_up", admission.reason)
-    for ledger in (book, replay(JobBook(), book.compact())):
+    for ledger in (book, JobBook().replay(book.compact())):
         assert not ledger.unsettled()
         changes = ledger.apply(end(2, "a", "finished", 5.0, 9))
         assert {change.status.job: change.status.state for change in changes} == {
@@ -108,7 +107,7 @@ def test_jobs_that_wait_for_a_job_that_is_given_up_are_given_up_until_that_one_i
 
 
 def test_a_late_fault_does_not_take_the_job_from_another_arm():
-    book = replay(JobBook(), [JobsAccepted((JOB,), "test", 0.0)])
+    book = JobBook().replay([JobsAccepted((JOB,), "test", 0.0)])
     for number, arm in enumerate("ab", start=1):
         book.apply(award(number, arm))
         book.apply(end(number, arm, "dropped", 1.0))
@@ -124,7 +123,7 @@ def test_a_late_fault_does_not_take_the_job_from_another_arm():
 
 
 def granter_of(disk: list[BookRecord]) -> Granter:
-    book = replay(JobBook(is_central=False), disk)
+    book = JobBook(is_central=False).replay(disk)
     return Granter("d", ROSTER, book, lambda *records: disk.extend(records), real_s=0.0)
 
 
@@ -191,7 +190,7 @@ def test_the_work_for_jobs_that_expire_together_grows_with_their_number():
 
     def calls(count: int) -> int:
         jobs = tuple(JobSpec(f"j{number}", "hold", ("x",), due_s=1.0, expires=True) for number in range(count))
-        book, calls = replay(JobBook(), [JobsAccepted(jobs, "test", 0.0)]), 0
+        book, calls = JobBook().replay([JobsAccepted(jobs, "test", 0.0)]), 0
 
         def count_call(*_: object) -> None:
             nonlocal calls
@@ -199,7 +198,7 @@ def test_the_work_for_jobs_that_expire_together_grows_with_their_number():
 
         sys.setprofile(count_call)
         try:
-            replay(book, book.expired(2.0))
+            book.replay(book.expired(2.0))
         finally:
             sys.setprofile(None)
         assert (len(book.jobs), book.unsettled()) == (MAX_SETTLED, [])

@@ -28,7 +28,6 @@ from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.book import JobBook
 from fleet.live.consensus.grants import Granter
 from fleet.live.consensus.participant import QUIET_S, Membership, Participant
-from fleet.live.doubts import replay
 from fleet.live.leases import Timing
 from fleet.live.records import SendAward
 from fleet.live.space import CellSpace
@@ -205,7 +204,7 @@ def observed_without_auctioneer(shift: LiveShift) -> dict[str, Observation]:
 
 def copy_of(book: JobBook, states: dict[str, State]) -> JobBook:
     """Return the book of an arm that knows what an auctioneer knows."""
-    copy = replay(JobBook(is_central=False), book.compact())
+    copy = JobBook(is_central=False).replay(book.compact())
     for name in NAMES:
         awards = {grant.record.space for grant in book.open.values() if grant.record.arm == name}
         copy.space[name] = frozenset(awards | {states[name].space} - {""})

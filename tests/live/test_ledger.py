@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from fleet.bus.protocol.auction import JobSpec, Quote
 from fleet.live.auction.rounds import Round, closed_space, stated_spaces
 from fleet.live.book import JobBook
-from fleet.live.doubts import replay
 from fleet.live.job_rules import PastJobs, admit
 from fleet.live.journal import ClockTick, CommitPermitted, JobsAccepted, SpaceTaken
 from fleet.live.records import BookRecord, ContactLost, ContactRegained, Granted, ShiftEnded
@@ -24,7 +23,7 @@ def spec(name: str, *after: str, place: str = "rack", **changes) -> JobSpec:
 
 
 def ledger(*jobs: JobSpec) -> JobBook:
-    return replay(JobBook(), [JobsAccepted(jobs, "test", 0.0)])
+    return JobBook().replay([JobsAccepted(jobs, "test", 0.0)])
 
 
 def award(job: str, number: int = 0, arm: str = "arm_0", cycles: int = 0, *, place: str = "rack") -> Granted:
@@ -206,9 +205,8 @@ steps = st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 9)), max_size=
 
 
 def three_jobs() -> JobBook:
-    return replay(
-        JobBook(), [JobsAccepted((spec("a"), spec("b", "a", place="bin"), spec("c", place="belt")), "test", 0.0)]
-    )
+    jobs = (spec("a"), spec("b", "a", place="bin"), spec("c", place="belt"))
+    return JobBook().replay([JobsAccepted(jobs, "test", 0.0)])
 
 
 def next_record(book: JobBook, job: str, choice: int, time_s: int):
@@ -243,7 +241,7 @@ def test_a_replay_of_the_journal_gives_the_same_ledger(steps):
     for time_s, (job, choice) in enumerate(steps, start=1):
         written.append(next_record(book, job, choice, time_s))
         changes.extend(book.apply(written[-1]))
-    again = replay(JobBook(), written)
+    again = JobBook().replay(written)
     assert again == book
     assert [change.number for change in changes] == list(range(3, 3 + len(changes)))
     assert again.number == 3 + len(changes)
@@ -259,7 +257,7 @@ def test_a_snapshot_gives_the_same_ledger_as_the_records(steps, later, ends):
     if ends:
         book.apply(ShiftEnded(50.0))
     record = msgspec.json.decode(msgspec.json.encode(book.compact()[0]), type=BookRecord)
-    short = replay(JobBook(), [record])
+    short = JobBook().replay([record])
     for time_s, (job, choice) in enumerate(later, start=100):
         record = next_record(book, job, choice, time_s)
         assert short.apply(record) == book.apply(record)
@@ -278,7 +276,7 @@ def test_a_late_report_changes_the_same_after_compaction(steps, data):
     reported = [grant.record.award for grant in grants if grant.outcome != "refused"]
     if not reported:
         return
-    short, name = replay(JobBook(), book.compact()), data.draw(st.sampled_from(reported))
+    short, name = JobBook().replay(book.compact()), data.draw(st.sampled_from(reported))
     outcome = data.draw(st.sampled_from(["finished", "returned"]))
     late = closed(name, outcome, 2, 100.0, faulted=outcome == "returned" and data.draw(st.booleans()))
     assert short.apply(late) == book.apply(late)
@@ -289,7 +287,7 @@ def test_a_ledger_and_its_snapshot_share_no_objects():
     book = ledger(spec("a"))
     book.apply(award("a"))
     record = book.compact()[0]
-    short = replay(JobBook(), [record])
+    short = JobBook().replay([record])
     book.apply(CommitPermitted("0:a", 2.0))
     assert not record.jobs[0].grants["0:a"].may_commit
     assert short.status()[0].state == "awarded"
@@ -315,12 +313,11 @@ def test_settled_jobs_leave_and_their_names_are_known(monkeypatch):
     book = JobBook(past=PastJobs(limit=4))
     for i in range(9):
         done = award(f"job {i}", i), closed(f"{i}:job {i}", "finished", 4, float(i))
-        replay(book, [JobsAccepted((spec(f"job {i}", due_s=float(i), expires=i == 4),)), *(done if i != 4 else ())])
-        replay(book, book.expired(4.5))
+        book.replay([JobsAccepted((spec(f"job {i}", due_s=float(i), expires=i == 4),)), *(done if i != 4 else ())])
+        book.replay(book.expired(4.5))
     book.apply(JobsAccepted((spec("next", "job 6"), spec("waits"))))
-    short = replay(
-        JobBook(past=PastJobs(limit=4)), msgspec.json.decode(msgspec.json.encode(book.compact()), type=list[BookRecord])
-    )
+    records = msgspec.json.decode(msgspec.json.encode(book.compact()), type=list[BookRecord])
+    short = JobBook(past=PastJobs(limit=4)).replay(records)
     for each in (book, short):
         assert list(each.jobs) == ["job 7", "job 8", "next", "waits"]
         assert each.left == {"finished": 6, "given_up": 1}
@@ -341,5 +338,5 @@ def test_only_open_jobs_count_against_the_limit(monkeypatch):
     monkeypatch.setattr("fleet.live.book.MAX_SETTLED", 2)
     book = ledger(spec("a"), spec("b"), spec("c"))
     for name in "ab":
-        replay(book, [award(name), closed(f"0:{name}", "finished", 4, 1.0)])
+        book.replay([award(name), closed(f"0:{name}", "finished", 4, 1.0)])
     assert (len(book.jobs), len(book.settled), list(book.waiting)) == (3, 2, ["c"])

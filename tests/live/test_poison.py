@@ -4,7 +4,6 @@ import gc
 import json
 import threading
 import time
-import zlib
 from collections import defaultdict
 from contextlib import ExitStack, suppress
 from copy import deepcopy
@@ -40,14 +39,14 @@ from fleet.bus.protocol.messages import MalformedMessage, State, decode, encode
 from fleet.bus.protocol.operator import ClearRequest
 from fleet.errors import Refused
 from fleet.job import Place
-from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, AwardExecutor
+from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardExecutor
 from fleet.live.arm.body import SimulatedBody
 from fleet.live.arm.estimator import MAX_BYTES, Estimator, NominalPeaks, _size
 from fleet.live.arm.node import ArmConfig, ArmNode, PlanningThread
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.rounds import Assignment
 from fleet.live.clock import FleetClock
-from fleet.live.journal import Journal, quarantine
+from fleet.live.journal import Journal
 from fleet.live.records import BookRecord
 from fleet.motion import Plan
 from fleet.robot import ThermalLimits
@@ -132,7 +131,7 @@ def participants(tmp_path_factory, small):
     own = small.arm(0, [small.work("bench")])
     planner = Planner(own.robot, elbows=1)
     with ExitStack() as stack:
-        book = stack.enter_context(Journal(folder / "arm_0", ArmRecord, sync=lambda file: None))
+        book = stack.enter_context(Journal(folder / "arm_0", ArmRecord, durable=False))
         history = ArmHistory().after_restart("arm_0", 0.0)
         estimator = Estimator(own.model, planner.plan, PLACES, NominalPeaks())
         body = SimulatedBody(
@@ -141,7 +140,7 @@ def participants(tmp_path_factory, small):
         executor = AwardExecutor("arm_0", book.append, history, nonce="n")
         clock = FleetClock(1.0, time.monotonic())
         arm = ArmNode(Wire(), body, executor, estimator, clock, ArmConfig(warning_c=60.0))
-        ledger = stack.enter_context(Journal(folder / "auctioneer", BookRecord, sync=lambda file: None))
+        ledger = stack.enter_context(Journal(folder / "auctioneer", BookRecord, durable=False))
         auction = AuctionNode(
             Wire(),
             "x",
@@ -288,19 +287,3 @@ def test_a_plan_that_takes_too_long_is_the_reason_and_the_next_job_is_quoted(sma
     assert (slow.feasible, quick.feasible) == (False, True)
     assert "planning took more than 1.5 s" in slow.reason
     assert len(steps) > 2
-
-
-def test_a_poisonous_award_in_a_journal_is_quarantined_and_the_rest_is_reported(tmp_path):
-    """A journal of an earlier version, which had no bounds."""
-    good = AwardAccepted(Award("good", "r", "x", "q", JOB))
-    poison = json.loads(encode(AwardAccepted(Award("poison", "r", "x", "q", JOB))))
-    poison["award"]["job"]["dwell_s"] = 60_000
-    records = json.dumps([{"type": "started", "boot": 3}, poison, json.loads(encode(good))]).encode()
-    path, aside = tmp_path / "a.journal", tmp_path / "a.aside"
-    path.write_bytes(b'{"crc":"%08x","records":%s}\n' % (zlib.crc32(records), records))
-    for _ in range(2):
-        with Journal(path, ArmRecord, quarantine=quarantine(aside, "a")) as book:
-            history = ArmHistory().replay(book.records()).after_restart("a", 0.0)
-            book.rewrite(*history.compact())
-    assert set(history.reports) == {"good"}
-    assert [json.loads(line)["award"]["award"] for line in aside.read_text().splitlines()] == ["poison"]

@@ -36,7 +36,6 @@ from fleet.live.auction.rounds import SCAN_S, Allocate
 from fleet.live.book import JobBook
 from fleet.live.clock import FleetClock
 from fleet.live.desk import JobDesk
-from fleet.live.doubts import replay
 from fleet.live.epochs import REMEDY, REPLY_S, ask_arms, check_begin, describe
 from fleet.live.journal import EpochBegun, Journal, Started, TimeRecorder, own_records
 from fleet.live.leases import Timing
@@ -164,7 +163,7 @@ class AuctionNode(JobDesk):
         self._link, self.journal = link, journal
         self._timing = timing or Timing()
         self._check_no_auctioneer()
-        book = self.book = replay(JobBook(places, arms), own_records(journal, name), journal.quarantine)
+        book = self.book = JobBook(places, arms).replay(own_records(journal, name))
         if not (book.epoch or new_epoch):
             check_begin(link.fleet, ask_arms(link))
         real_s = time.monotonic()

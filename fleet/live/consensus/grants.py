@@ -205,8 +205,6 @@ class Granter:
             return f"a person has '{entry.job}' done again"
         if before is not None and before.revoked:
             return f"the space of '{arm}' was cleared"
-        if (job.aside or entry.job in book.aside) and not same:
-            return f"'{entry.job}' is quarantined"
         cancel = book.operations.cancelled(entry.job)
         if cancel is not None and not (grant is not None and same and grant.may_commit):
             if same:  # its arm ends the cycle in progress, which may take longer than a lease

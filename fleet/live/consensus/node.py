@@ -79,8 +79,8 @@ class ConsensusNode(JobDesk):
         """
         super().__init__(arm.executor.arm, arm.clock.speed, membership.cell)
         self._arm, self._link, self._membership = arm, arm.link, membership
-        book = JobBook(membership.places, name=self._name, is_central=False)
-        self.book = book.replay(own_records(journal, self._name), journal.quarantine)
+        book = self.book = JobBook(membership.places, name=self._name, is_central=False)
+        book.replay(own_records(journal, self._name))
         book.apply(Started(self._name))
         real_s = time.monotonic()
         self._recorder = TimeRecorder(journal, book, real_s)

@@ -27,8 +27,8 @@ from fleet.bus.protocol.messages import State
 from fleet.bus.router import Router
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.rounds import Assignment
-from fleet.live.journal import Journal, quarantine
-from fleet.live.records import BookRecord, salvage
+from fleet.live.journal import Journal
+from fleet.live.records import BookRecord
 from tests.waiting import PATIENCE_S
 
 
@@ -113,14 +113,12 @@ class Bus:
         self.arms.append(Arm(self.stack.enter_context(BusClient(self.endpoint, "f")), name))
         return self.arms[-1]
 
-    def auctioneer(self, name="auctioneer", sync=None, folder="", **options):
+    def auctioneer(self, name="auctioneer", folder="", **options):
         """Start an auctioneer with resources of its own, which `kill` closes."""
-        extra = {} if sync is None else {"sync": sync}
         with ExitStack() as resources:
             link = resources.enter_context(BusClient(self.endpoint, "f"))
             path = self.folder / folder / name
-            extra["quarantine"] = salvage(quarantine(path.with_suffix(".aside"), name))
-            journal = resources.enter_context(Journal[BookRecord](path, BookRecord, **extra))
+            journal = resources.enter_context(Journal[BookRecord](path, BookRecord))
             node = AuctionNode(link, name, journal, **{"allocate": first_come, "speed": 60.0, **options})
             node.resources = self.stack.enter_context(resources.pop_all())
         self.nodes.append(node)

@@ -79,7 +79,7 @@ class Arm:
 def node(tmp_path_factory):
     with ExitStack() as stack:
         path = tmp_path_factory.mktemp("poison") / "grants"
-        journal = stack.enter_context(Journal(path, BookRecord, sync=lambda file: None))
+        journal = stack.enter_context(Journal(path, BookRecord, durable=False))
         membership = Membership(fleet=LiveFleet(arms=ROSTER), choose=Consensus().choose)
         node = ConsensusNode(Arm(), membership, journal, boot=1)
         node._take_epoch("e")

@@ -19,7 +19,6 @@ from fleet.errors import BusError, Refused
 from fleet.live.arm.awards import ArmHistory, AwardExecutor
 from fleet.live.book import JobBook
 from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Claimant, Granter
-from fleet.live.doubts import replay
 from fleet.live.epochs import check_journals
 from fleet.live.leases import Timing
 from tests.live.disk import Disk
@@ -40,9 +39,7 @@ def granter(disk):
 
 
 def restarted(disk, real_s):
-    return Granter(
-        "d", ROSTER, replay(JobBook(is_central=False), disk.records), disk.keep, real_s=real_s, timing=TIMING
-    )
+    return Granter("d", ROSTER, JobBook(is_central=False).replay(disk.records), disk.keep, real_s=real_s, timing=TIMING)
 
 
 def entry(award="a-1:j", job="j", *, place="x", cycles=0, phase="requested"):
@@ -150,7 +147,7 @@ def test_a_compacted_book_has_fewer_records(granter, disk):
     granter.answer_claim(claim("c", 4, entry("c-1:l", "l", place="y", phase="finishing")), 1.0)
     records = granter.book.compact()
     assert len(records) < len(disk.records)
-    assert replay(JobBook(is_central=False), records).compact() == records
+    assert JobBook(is_central=False).replay(records).compact() == records
 
 
 # Claims
@@ -167,7 +164,7 @@ class One:
         self.granter = Granter(
             "a",
             roster,
-            replay(JobBook(is_central=False), self.grants.records),
+            JobBook(is_central=False).replay(self.grants.records),
             self.grants.keep,
             real_s=0.0,
             timing=TIMING,
@@ -343,7 +340,7 @@ class Granting:
             self.claim(arm)
 
     def start(self, real_s: float) -> None:
-        book = replay(JobBook(is_central=False), self.records)
+        book = JobBook(is_central=False).replay(self.records)
         self.records[:] = book.compact()
         self.granter = Granter(
             "c",
