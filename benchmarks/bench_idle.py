@@ -51,7 +51,7 @@ def main() -> None:
             wait_until(fleet, lambda: " is up" in Path(log.name).read_text())
             print(f"up after {time.monotonic() - began_s:.1f} s")
             if given.award:
-                journal = Path(folder, "journals", "auctioneer.journal")
+                journal = Path(folder, "journals", "auctioneer.journal-wal")
                 wait_until(fleet, lambda: journal.exists() and b'"award"' in journal.read_bytes())
                 print(f"first award after {time.monotonic() - began_s:.1f} s")
                 return

@@ -26,22 +26,23 @@ class Crash(BaseException):  # no handler of the product may catch it
 
 @dataclass(eq=False)
 class File:
-    """Content of a file, what of it is written through, and the writes since."""
+    """Content of a file, and the writes that are not written through."""
 
     data: bytearray = field(default_factory=bytearray)
-    synced: bytes = b""
-    unsynced: list[tuple[int, bytes | None]] = field(default_factory=list[tuple[int, bytes | None]])
-    """Where, and what; None: truncated there."""
+    unsynced: list[tuple[int, bytes | None, bytes, int]] = field(default_factory=list[Any])
+    """Where and what (None: the end was cut off); what was there before, and the size before."""
 
     def write(self, start: int, content: bytes) -> None:
-        self.change(start, content)
-        self.unsynced.append((start, content))
+        """Write; what lies between the end and `start` is zero."""
+        self.unsynced.append((start, content, bytes(self.data[start : start + len(content)]), len(self.data)))
+        self._change(start, content)
 
     def truncate(self, size: int) -> None:
-        self.change(size, None)
-        self.unsynced.append((size, None))
+        """Cut the end off."""
+        self.unsynced.append((size, None, bytes(self.data[size:]), len(self.data)))
+        self._change(size, None)
 
-    def change(self, start: int, content: bytes | None) -> None:
+    def _change(self, start: int, content: bytes | None) -> None:
         if content is None:
             del self.data[start:]
             return
@@ -50,16 +51,19 @@ class File:
         self.data[start : start + len(content)] = content
 
     def sync(self) -> None:
-        self.synced, self.unsynced = bytes(self.data), []
+        """Write through."""
+        self.unsynced.clear()
 
     def lose(self, rng: Random) -> None:
         """Lose writes since the last sync: any of them, or the end of one."""
-        unsynced, self.unsynced, self.data = self.unsynced, [], bytearray(self.synced)
-        for start, content in unsynced:
+        lost, self.unsynced = self.unsynced, []
+        for start, _, before, size in reversed(lost):
+            self.data[start : start + len(before)] = before
+            del self.data[size:]
+        for start, content, _, _ in lost:
             if (chance := rng.random()) < 0.7:
                 torn = content if content is None or chance < 0.5 else content[: rng.randrange(len(content) + 1)]
-                self.change(start, torn)
-        self.synced = bytes(self.data)
+                self._change(start, torn)
 
 
 class Disk:
