@@ -161,7 +161,7 @@ class Popen:
     def __init__(self, world: World, argv: tuple[str, ...], **options: Any) -> None:
         self.pid, self.returncode = world.rng.getrandbits(16), None
         self.stdout: Any = nullcontext(["ready\n"])
-        self._process, self._world, self.ends = world.processes[argv[0]], world, lambda: None
+        self._process, self._world, self.threads = world.processes[argv[0]], world, list["Thread"]()
         world.after(world.rng.uniform(0.05, 0.8), self._start)
 
     def _start(self) -> None:
@@ -172,7 +172,8 @@ class Popen:
     def _exit(self, code: int) -> None:
         if self.returncode is None:
             self.returncode: int | None = code
-            self.ends()
+            for thread in self.threads:
+                thread.run()
 
     def poll(self) -> int | None:
         return self.returncode
@@ -191,13 +192,14 @@ class Popen:
 
 
 class Thread:
-    """The thread that copies the output of a process: it runs when the process has ended."""
+    """A thread that reads the output of a process, or awaits its end: it runs when the process has ended."""
 
     def __init__(self, target: Callable[..., None], args: tuple[Any, ...], daemon: bool = True) -> None:
         self._call = lambda: target(*args)
-        args[1].ends = self._run
+        args[1].threads.append(self)
 
-    def _run(self) -> None:
+    def run(self) -> None:
+        """Run to the end."""
         with suppress(OSError):  # an error ends a thread, and nothing else
             self._call()
 

@@ -266,6 +266,7 @@ class Supervisor:
         running.process = process
         running.copier = threading.Thread(target=self._copy_log, args=(running, process), daemon=True)
         running.copier.start()
+        threading.Thread(target=self._await_exit, args=(running, process), daemon=True).start()
 
     def _launch_again(self, running: _Running) -> None:
         """Start a process again; if the system cannot, later."""
@@ -286,7 +287,12 @@ class Supervisor:
                 log.write(line)
                 if line.startswith(running.part.ready):
                     running.ready.set()
+
+    def _await_exit(self, running: _Running, process: "subprocess.Popen[str]") -> None:
+        """Note the exit of a process, also if one that it has started still holds its output open."""
         process.wait()
+        assert running.copier is not None
+        running.copier.join(LOG_S)
         self._ended.put(running.part.name)
 
     def _handle_exit(self, running: _Running) -> bool:

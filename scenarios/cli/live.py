@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 UNHEALTHY = 1
 """Exit code of `bus doctor`; 0 is a healthy fleet, and 2, as for every error of use, one that cannot be reached."""
 _TLS = "Mutual TLS"
+_WEBHOOK = option(
+    "URL that gets every change of an alarm; may be repeated. It is signed with THERMOFLEET_WEBHOOK_SECRET; beyond "
+    "this machine it must be https.",
+    None,
+)
 
 
 def up_command(
@@ -45,6 +50,7 @@ def up_command(
     ),
     host: str = option("--tls: address on which the router listens, as 0.0.0.0. Default: loopback only.", ""),
     page: bool = option(f"Also serve a live page (bus gateway --page), on port {PAGE_PORT} if free.", False),
+    webhook: list[str] | None = _WEBHOOK,
 ) -> None:
     """Start a fleet, one process per participant, and run it until its jobs are done.
 
@@ -53,8 +59,10 @@ def up_command(
     """
     from scenarios.live.fleet_processes import run_fleet
 
-    spec = LiveSpec(**given)
-    run_fleet(scenario, spec, out=out, port=port, tls=tls, arms=arms, router=router, host=host, page=page)
+    if webhook and not page:
+        raise FleetError("--webhook is sent by the gateway of the page: add --page.")
+    place = {"port": port, "tls": tls, "arms": arms, "router": router, "host": host}
+    run_fleet(scenario, LiveSpec(**given), out=out, **place, page=page, webhooks=webhook or ())
 
 
 def arm_command(
@@ -256,11 +264,7 @@ def gateway_command(
         None,
     ),
     recording: Path | None = option("Recording of the fleet, whose alarms the gateway continues.", None),
-    webhook: list[str] | None = option(
-        "URL that gets every change of an alarm; may be repeated. It is signed with THERMOFLEET_WEBHOOK_SECRET; beyond "
-        "this machine it must be https.",
-        None,
-    ),
+    webhook: list[str] | None = _WEBHOOK,
 ) -> None:
     """Serve the fleet over HTTP until Ctrl-C or SIGTERM; with --page also a live page for browsers."""
     if scenario and not page:

@@ -3,6 +3,7 @@
 import os
 import socket
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -100,6 +101,7 @@ def run_fleet(
     router: str = "",
     host: str = "",
     page: bool = False,
+    webhooks: Sequence[str] = (),
 ) -> None:
     """Start a fleet, or a part of it, and keep it running until its jobs are done, Ctrl-C or SIGTERM.
 
@@ -115,7 +117,7 @@ def run_fleet(
     names = chosen_arms(arms, tuple(arm.name for arm in chosen.arms))
     _check_place(arms, router, host, names[0], tls)
     if page:
-        _check_page(tls)
+        _check_page(tls, webhooks)
     if tls is not None:
         check_roster(tls, scenario)
     if plans(spec.policy):  # before anything is started
@@ -138,8 +140,9 @@ def run_fleet(
         host=host,
         at=router,
     )
-    shown = page_of(scenario, fleet, router or own_router.ready, tls, folder / "recording") if page else None
-    at, count = router or own_router.ready, f"{len(parts)} arm{'s' * (len(parts) > 1)}"
+    at = router or own_router.ready
+    shown = page_of(scenario, fleet, at, tls, folder / "recording", webhooks) if page else None
+    count = f"{len(parts)} arm{'s' * (len(parts) > 1)}"
     central = f"{count}, which allocate the jobs" if auction is None else f"{count} and the auctioneer"
     say(f"Starting {count if router else f'the router, the recorder, {central}'} …", err_console)
     share_memory()
@@ -179,24 +182,30 @@ def run_fleet(
     stop.leave(f"The fleet was stopped; journals, recording and logs are in {folder}; the same command continues.")
 
 
-def page_of(scenario: str, fleet: str, at: str, tls: Path | None, recording: Path) -> Part:
+def page_of(
+    scenario: str, fleet: str, at: str, tls: Path | None, recording: Path, webhooks: Sequence[str] = ()
+) -> Part:
     """The live page of a fleet, on a port that is free now; it keeps the port when it is restarted."""
     endpoint, port = at if tls is None else Tls(tls, "operator").endpoint(at), free_port(PAGE_PORT)
     words = ("bus", "gateway", "--page", "--scenario", scenario, "--endpoint", endpoint, "--fleet", fleet)
-    argv = (*PROGRAM, *words, "--recording", str(recording), "--port", str(port))
+    targets = [word for url in webhooks for word in ("--webhook", url)]
+    argv = (*PROGRAM, *words, "--recording", str(recording), "--port", str(port), *targets)
     return Part(name="page", argv=argv, rank=4, ready=f"{PAGE_READY}http://127.0.0.1:{port}/")
 
 
-def _check_page(tls: Path | None) -> None:
+def _check_page(tls: Path | None, webhooks: Sequence[str]) -> None:
     """Check that the page can be served.
 
     Raises:
         MissingExtra: a library is missing.
-        FleetError: a token or a certificate is missing.
+        FleetError: a token or a certificate is missing, or a webhook cannot be used.
     """
     require_extra("gateway")
     require_extra("report")
     from scenarios.live.gateway import TOKEN
+    from scenarios.live.webhooks import webhooks_of
+
+    webhooks_of(webhooks)
 
     if tls is not None and not os.environ.get(TOKEN):
         raise FleetError(f"With --tls the page needs a token: set {TOKEN} to 16 or more random characters.")

@@ -64,7 +64,7 @@ from fleet.live.monitor.snapshot import MAX_JOBS
 from fleet.live.supervisor import return_memory
 from scenarios.cli.options import the_fleet
 from scenarios.live.metrics import CONTENT_TYPE, exposition
-from scenarios.live.webhooks import SECRET, Webhook
+from scenarios.live.webhooks import Webhook, webhooks_of
 from scenarios.signals import until_stopped
 from scenarios.spec.job_table import read_job_table, shift_begin, with_cell
 from scenarios.spec.schema import Scenario
@@ -600,7 +600,7 @@ def run_gateway(
             kept = alarms_of(recording)
         except FleetError as error:
             _LOG.error("The alarms of the recording are not continued: %s", error)
-    hooks = [Webhook(url, os.environ.get(SECRET, "")) for url in webhooks]
+    hooks = webhooks_of(webhooks)
     roles = read_tokens(tokens) if tokens else {}
     if token:
         roles[check_token(token)] = "operator"

@@ -9,9 +9,11 @@ import hashlib
 import hmac
 import ipaddress
 import logging
+import os
 import ssl
 import time
 from collections import deque
+from collections.abc import Iterable
 from urllib.parse import urlsplit
 
 from fleet.bus.protocol.messages import encode
@@ -113,6 +115,11 @@ class Webhook:
             raise ValueError("no reply of HTTP") from error
         finally:
             writer.transport.abort()
+
+
+def webhooks_of(urls: Iterable[str]) -> list[Webhook]:
+    """Return the targets of these URLs, with the secret of the environment. Raises FleetError as `Webhook`."""
+    return [Webhook(url, os.environ.get(SECRET, "")) for url in urls]
 
 
 def _is_loopback(host: str) -> bool:

@@ -68,6 +68,19 @@ def test_delays_grow_up_to_a_limit(failures, first_s, factor, max_s):
     assert waits[-1] <= max_s
 
 
+def test_a_killed_process_is_restarted_while_its_child_holds_the_output_open(tmp_path):
+    code = f"import subprocess, sys; subprocess.Popen([sys.executable, '-c', {WAIT!r}]); {WAIT}"
+    with Supervisor(tmp_path, backoff=Backoff(first_s=0.05)) as supervisor:
+        supervisor.start(part("a", code), ready_s=PATIENCE_S)
+        first = supervisor.pid("a")
+        try:
+            os.kill(first, signal.SIGKILL)
+            supervisor.run(until(lambda: supervisor.restarts()["a"] == 1), poll_s=0.05)
+        finally:
+            os.killpg(first, signal.SIGKILL)
+            os.killpg(supervisor.pid("a"), signal.SIGKILL)
+
+
 def test_a_killed_process_is_restarted(tmp_path):
     with Supervisor(tmp_path, backoff=Backoff(first_s=0.05)) as supervisor:
         supervisor.start(part("a", WAIT), ready_s=PATIENCE_S)

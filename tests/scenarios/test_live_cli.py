@@ -393,6 +393,19 @@ def test_a_shift_is_not_continued_with_the_other_kind_of_allocation(thermofleet,
     assert complaint in " ".join(err.split())
 
 
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("--webhook http://127.0.0.1:9/", "add --page"),
+        ("--page --webhook http://127.0.0.1:9/", "set THERMOFLEET_WEBHOOK_SECRET to 16 or more characters"),
+    ],
+)
+def test_up_refuses_a_webhook_that_cannot_be_sent_before_it_plans(thermofleet, tmp_path, words, says):
+    code, _, err = thermofleet("up", "quickstart", *words.split(), "--out", tmp_path)
+    assert code == 2
+    assert says in " ".join(err.split())
+
+
 def test_up_refuses_a_port_in_use_before_it_plans(thermofleet, tmp_path):
     with socket.socket() as held:
         held.bind(("127.0.0.1", 0))

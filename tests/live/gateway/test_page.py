@@ -186,9 +186,10 @@ def test_the_snapshot_names_the_paused_arms_and_as_many_jobs_as_asked_for(served
 
 
 def test_up_starts_the_page_with_the_certificate_of_an_operator(tmp_path):
-    part = page_of("quickstart", "q", "tls/127.0.0.1:7447", tmp_path, tmp_path / "recording")
+    part = page_of("quickstart", "q", "tls/127.0.0.1:7447", tmp_path, tmp_path / "recording", ["http://[::1]:9/"])
     assert part.argv[part.argv.index("--endpoint") + 1] == f"tls/127.0.0.1:7447#{tmp_path}/operator"
-    assert part.ready == f"ready page http://127.0.0.1:{part.argv[-1]}/"
+    assert part.ready == f"ready page http://127.0.0.1:{part.argv[part.argv.index('--port') + 1]}/"
+    assert part.argv[-2:] == ("--webhook", "http://[::1]:9/")
 
 
 def test_the_page_is_small():
