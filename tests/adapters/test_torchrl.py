@@ -21,8 +21,8 @@ ARMS, TICKS = 3, 15
 def make(small_batch):
     """Makes environments of small shifts: `make(envs, seed, state=…, infos=…, jobs=…)`."""
 
-    def make(envs: int = 5, seed: int | None = 3, *, state: bool = False, infos: bool = False, **shift) -> TorchRLEnv:
-        return TorchRLEnv(batch(envs, **shift), seed=seed, state=state, infos=infos)
+    def make(envs: int = 5, seed: int | None = 3, *, joined=True, state=False, infos=False, **shift) -> TorchRLEnv:
+        return TorchRLEnv(batch(envs, **shift), seed=seed, joined=joined, state=state, infos=infos)
 
     def batch(envs: int, *, autoreset: bool = False, **shift) -> BatchEnv:
         return small_batch(num_envs=envs, autoreset=autoreset, **shift)
@@ -44,11 +44,18 @@ def same(one: TensorDict, two: TensorDict) -> bool:
     return bool((one == two).all())
 
 
-@pytest.mark.parametrize("switches", [{}, {"state": True}, {"infos": True}, {"state": True, "infos": True}], ids=str)
+@pytest.mark.parametrize("switches", [{}, {"state": True}, {"infos": True}, {"joined": False, "state": True}], ids=str)
 @pytest.mark.parametrize("envs", [1, 4])
 def test_torchrl_finds_the_specs_kept(make, envs, switches) -> None:
     check_env_specs(make(envs, **switches))
     check_env_specs(make(envs, **switches), break_when_any_done=False)
+
+
+def test_the_parts_of_an_observation_joined_are_its_vectors(make) -> None:
+    whole, parts = rolled(make(4), 30), rolled(make(4, joined=False), 30)
+    shared = parts["shared"].unsqueeze(-2).expand(4, 30, ARMS, -1)
+    assert torch.equal(torch.cat([shared, parts["arms", "own"]], dim=-1), whole["arms", "observation"])
+    assert torch.equal(parts["arms", "action"], whole["arms", "action"])
 
 
 @pytest.mark.parametrize("shift", [{"hard_due": 0.0}, BRIEF], ids=["cut", "brief"])

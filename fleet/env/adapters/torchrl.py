@@ -4,7 +4,8 @@ Example, installation and tested versions: docs/trainers.md.
 
 | key | value |
 |---|---|
-| ("arms", "observation") | float32 [env, arm, size] |
+| ("arms", "observation") | float32 [env, arm, size], the parts below joined |
+| "shared", ("arms", "own") | float32 [env, shared] and [env, arm, own], instead, with `joined=False` |
 | ("arms", "action_mask") | bool [env, arm, action] |
 | ("arms", "action") | int64 [env, arm] |
 | ("arms", "reward") | float32 [env, arm, 1], the team's reward of the whole step for every arm |
@@ -22,8 +23,8 @@ Traps:
 - With `decisions="events"` steps differ in length. Value estimators raise gamma to the power of the entry that
   `set_keys(steps_to_next_obs=("next", "arms", "elapsed_s"))` names: make gamma the discount of one second.
 - Use one thread (`OMP_NUM_THREADS=1`): the arrays are too small for more threads to help.
-- `rollout` stacks its frames into new tensors. `fleet.env.vector.keep_pages()`, called once, keeps the system from
-  clearing their memory for every rollout, which gives half as many steps per second again.
+- `rollout` stacks its frames into new tensors, each observation twice. With `joined=False` there is less to stack, and
+  `fleet.env.vector.keep_pages()`, called once, keeps the system from clearing their memory for every rollout.
 """
 
 # pyright: reportPrivateImportUsage=false
@@ -51,32 +52,45 @@ class TorchRLEnv(EnvBase):
     Args:
         batch: Made with `autoreset=False`: TorchRL resets finished envs, by "_reset".
         seed: As in `set_seed`; by default the seed of the batch.
+        joined: Join the parts of an observation to the vector of each arm.
         state: Include "state".
         infos: Include the infos, numbers of `BatchEnv.step`.
     """
 
-    def __init__(self, batch: BatchEnv, *, seed: int | None = None, state: bool = False, infos: bool = False) -> None:
+    def __init__(
+        self,
+        batch: BatchEnv,
+        *,
+        seed: int | None = None,
+        joined: bool = True,
+        state: bool = False,
+        infos: bool = False,
+    ) -> None:
         batch = check_batch("TorchRLEnv", batch, autoreset=False)
         super().__init__(device="cpu", batch_size=(batch.num_envs,))
         self.batch = batch
         self.layout = batch.layout
         self.group_map = {GROUP: list(batch.agents)}
-        self._state, self._infos = state, infos
+        self._joined, self._state, self._infos = joined, state, infos
         self._seed = seed
         self._done = torch.zeros(batch.num_envs, 1, dtype=torch.bool)
         """Envs reported to TorchRL as done."""
         self._ended = self._done
         """Envs of the batch whose episode is over; other done envs have started a new one that nobody sees."""
-        envs, arms, size = batch.num_envs, len(batch.agents), batch.layout.size
-        actions = batch.layout.actions
-        low, high = (torch.from_numpy(bound.copy()).expand(envs, arms, size) for bound in batch.layout.bounds)
+        envs, arms = batch.num_envs, len(batch.agents)
+        actions, cut = batch.layout.actions, batch.layout.shared
+        low, high = (torch.from_numpy(bound.copy()).expand(envs, arms, -1) for bound in batch.layout.bounds)
         seen = Composite(
-            observation=Bounded(low, high, dtype=torch.float32),
             action_mask=Binary(actions, shape=Size((envs, arms, actions)), dtype=torch.bool),
             elapsed_s=Unbounded(Size((envs, arms, 1))),
             shape=(envs, arms),
         )
         observed: dict[str, Any] = {GROUP: seen}
+        if joined:
+            seen["observation"] = Bounded(low, high, dtype=torch.float32)
+        else:
+            seen["own"] = Bounded(low[..., cut:], high[..., cut:], dtype=torch.float32)
+            observed["shared"] = Bounded(low[:, 0, :cut], high[:, 0, :cut], dtype=torch.float32)
         if infos:
             seen["info"] = Composite({name: Unbounded(Size((envs, arms, 1))) for name in ARM_INFOS}, shape=(envs, arms))
             observed["info"] = Composite({name: Unbounded(Size((envs, 1))) for name in TEAM_INFOS}, shape=(envs,))
@@ -151,20 +165,21 @@ class TorchRLEnv(EnvBase):
     def _tensors(self, obs: Obs, info: Infos, **ends: torch.Tensor) -> TensorDict:
         """Result of the batch as tensors that share the arrays' memory."""
         envs, arms = self.batch.num_envs, len(self.batch.agents)
-        vectors = torch.from_numpy(self.layout.join(obs["shared"], obs["own"]))
         mask = torch.from_numpy(obs["action_mask"]).view(torch.bool)
         self._action.update_mask(mask)
         self._mask = mask
         elapsed_s = np.repeat(info["elapsed_s"].astype(np.float32), arms).reshape(envs, arms, 1)
-        group: dict[str, Any] = {
-            "observation": vectors, "action_mask": mask, "elapsed_s": torch.from_numpy(elapsed_s)
-        }  # fmt: skip
+        group: dict[str, Any] = {"action_mask": mask, "elapsed_s": torch.from_numpy(elapsed_s)}
         source: dict[str, Any] = dict(ends)
+        if self._joined or self._state:
+            vectors = torch.from_numpy(self.layout.join(obs["shared"], obs["own"]))
+            group |= {"observation": vectors} if self._joined else {}
+            source |= {"state": vectors.reshape(envs, -1)} if self._state else {}
+        if not self._joined:
+            group["own"], source["shared"] = torch.from_numpy(obs["own"]), torch.from_numpy(obs["shared"])
         if self._infos:
             group["info"] = _leaves(info, ARM_INFOS, (envs, arms))
             source["info"] = _leaves(info, TEAM_INFOS, (envs,))
-        if self._state:
-            source["state"] = vectors.reshape(envs, -1)
         source[GROUP] = TensorDict(group, (envs, arms), device=self.device)
         return TensorDict(source, (envs,), device=self.device)
 
