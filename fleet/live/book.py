@@ -389,7 +389,8 @@ class JobBook(TimedState[BookRecord]):
         has = entry.grant is not None and not entry.grant.revoked and entry.state != "waiting"
         award = entry.award if (has or entry.state == "finished") and entry.award != NO_AWARD else ""
         done = (entry.cycles, entry.finished_s, entry.reason)
-        return with_terms(JobStatus(entry.name, entry.state, entry.arm, award, *done), entry.spec)
+        since = {"accepted_s": entry.accepted_s, "shift_ended": entry.shift_ended}
+        return with_terms(JobStatus(entry.name, entry.state, entry.arm, award, *done, **since), entry.spec)
 
     # Changes
 
@@ -448,7 +449,7 @@ class JobBook(TimedState[BookRecord]):
                 self.ended = True
                 changed = [self.jobs[name] for name in self.unsettled()]
                 for entry in changed:
-                    self._move(entry, "unfinished", entry.reason or SHIFT_ENDED)
+                    self._move(entry, "unfinished" if entry.state == "unfinished" else "waiting", entry.reason)
             case SpaceTaken():
                 self.space[record.arm] = frozenset(record.space)
             case SpaceCleared(arm):
@@ -486,6 +487,7 @@ class JobBook(TimedState[BookRecord]):
                 continue
             del self._unknown[job.name]
             entry.spec, entry.by, self._in_order = self.operations.changed(job), record.by, None
+            entry.accepted_s = record.time_s
             entry.submitted = job if entry.spec != job else None
             if entry.state == "waiting":
                 self._move(entry, "waiting", entry.reason)
@@ -749,11 +751,12 @@ class JobBook(TimedState[BookRecord]):
 
     def _move(self, entry: JobEntry, state: JobState, reason: str = "") -> None:
         """Change the state of a job."""
+        entry.shift_ended = state == "waiting" and self.ended and not entry.aside
         if state == "finished":
             entry.aside = ""
         elif entry.aside:
             state, reason = "unfinished", reason_of_aside(entry.aside)
-        elif state == "waiting" and self.ended:
+        elif entry.shift_ended:
             known = entry.reason if entry.state == "unfinished" else reason
             state, reason = "unfinished", known or SHIFT_ENDED
         self.waiting.pop(entry.name, None)

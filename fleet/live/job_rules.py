@@ -309,6 +309,11 @@ def with_terms(status: JobStatus, job: JobSpec | None) -> JobStatus:
     return replace(status, repetitions=job.repetitions, due_s=job.due_s, value=job.value, release_s=job.release_s)
 
 
+def waits_since_s(status: JobStatus) -> float | None:
+    """Return the fleet time since which an arm may begin a job: its release or acceptance; None for unknown."""
+    return max((each for each in (status.release_s, status.accepted_s) if each is not None), default=None)
+
+
 def finish_s(status: JobStatus, state: State | None) -> float | None:
     """Return the expected fleet time at which a job is finished, by the last state of its arm; None for unknown."""
     at_work = status.state in ("awarded", "finishing") and state is not None and state.job == status.job
