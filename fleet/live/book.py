@@ -389,8 +389,8 @@ class JobBook(TimedState[BookRecord]):
         has = entry.grant is not None and not entry.grant.revoked and entry.state != "waiting"
         award = entry.award if (has or entry.state == "finished") and entry.award != NO_AWARD else ""
         done = (entry.cycles, entry.finished_s, entry.reason)
-        since = {"accepted_s": entry.accepted_s, "shift_ended": entry.shift_ended}
-        return with_terms(JobStatus(entry.name, entry.state, entry.arm, award, *done, **since), entry.spec)
+        status = JobStatus(entry.name, entry.state, entry.arm, award, *done, shift_ended=entry.shift_ended)
+        return with_terms(replace(status, accepted_s=entry.accepted_s), entry.spec)
 
     # Changes
 
@@ -449,7 +449,7 @@ class JobBook(TimedState[BookRecord]):
                 self.ended = True
                 changed = [self.jobs[name] for name in self.unsettled()]
                 for entry in changed:
-                    self._move(entry, "unfinished" if entry.state == "unfinished" else "waiting", entry.reason)
+                    self._move(entry, "waiting", entry.reason)
             case SpaceTaken():
                 self.space[record.arm] = frozenset(record.space)
             case SpaceCleared(arm):
