@@ -16,6 +16,7 @@ from msgspec.structs import replace
 from fleet.bus.protocol.auction import MOST_JOBS, SETTLED, Admission, JobSpec, JobStatus, Status
 from fleet.bus.protocol.messages import LISTED_BYTES, State, encode
 from fleet.bus.protocol.operator import Change
+from fleet.errors import listed
 
 MAX_OPEN_JOBS = 10_000
 """Jobs of one auctioneer that are neither finished nor given up; more are refused."""
@@ -155,7 +156,7 @@ def admit(
         elif job.name in aside:
             rejected[index] = f"A job '{job.name}' is quarantined, and may have been done: settle it first."
         elif unknown:
-            rejected[index] = f"No place '{unknown[0]}' in this cell. Places: {', '.join(sorted(places or ()))}."
+            rejected[index] = f"No place '{unknown[0]}' in this cell. Places: {listed(sorted(places or ()))}."
         elif count + len(new) >= limit:
             rejected[index] = f"There are {limit} open jobs already; submit it again when some are finished."
         else:
