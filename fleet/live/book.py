@@ -388,9 +388,8 @@ class JobBook(TimedState[BookRecord]):
         """Return the status of a job."""
         has = entry.grant is not None and not entry.grant.revoked and entry.state != "waiting"
         award = entry.award if (has or entry.state == "finished") and entry.award != NO_AWARD else ""
-        done = (entry.cycles, entry.finished_s, entry.reason)
-        status = JobStatus(entry.name, entry.state, entry.arm, award, *done, shift_ended=entry.shift_ended)
-        return with_terms(replace(status, accepted_s=entry.accepted_s), entry.spec)
+        status = JobStatus(entry.name, entry.state, entry.arm, award, entry.cycles, entry.finished_s, entry.reason)
+        return replace(with_terms(status, entry.spec), accepted_s=entry.accepted_s, shift_ended=entry.shift_ended)
 
     # Changes
 
@@ -487,8 +486,7 @@ class JobBook(TimedState[BookRecord]):
                 continue
             del self._unknown[job.name]
             entry.spec, entry.by, self._in_order = self.operations.changed(job), record.by, None
-            entry.accepted_s = record.time_s
-            entry.submitted = job if entry.spec != job else None
+            entry.submitted, entry.accepted_s = job if entry.spec != job else None, record.time_s
             if entry.state == "waiting":
                 self._move(entry, "waiting", entry.reason)
             new.append(entry)
@@ -757,8 +755,7 @@ class JobBook(TimedState[BookRecord]):
         elif entry.aside:
             state, reason = "unfinished", reason_of_aside(entry.aside)
         elif entry.shift_ended:
-            known = entry.reason if entry.state == "unfinished" else reason
-            state, reason = "unfinished", known or SHIFT_ENDED
+            state, reason = "unfinished", (entry.reason if entry.state == "unfinished" else reason) or SHIFT_ENDED
         self.waiting.pop(entry.name, None)
         self._unsettle(entry)
         entry.state, entry.reason = state, reason
