@@ -109,8 +109,13 @@ def check_coordinates(value: object, *fields: str) -> None:
         if not all(abs(coordinate) <= MOST_M for coordinate in point):
             raise ValueError(
                 f"{type(value).__name__}.{name} must be coordinates between -{MOST_M:g} and {MOST_M:g} m "
-                f"(got {', '.join(map(str, point))}); were millimetres meant?"
+                f"(got {listed(point)}); were millimetres meant?"
             )
+
+
+def listed(values: Iterable[object]) -> str:
+    """Values in an error message, with commas between them; "none" if there are none."""
+    return ", ".join(map(str, values)) or "none"
 
 
 def nearest(name: str, allowed: Iterable[str]) -> str:
@@ -122,7 +127,7 @@ def nearest(name: str, allowed: Iterable[str]) -> str:
     names = sorted(allowed)
     close = get_close_matches(name, names, n=1)
     hint = f"; did you mean '{close[0]}'?" if close else "."
-    return f"{hint} Allowed: {', '.join(names)}."
+    return f"{hint} Allowed: {listed(names)}."
 
 
 MAX_NAME = 128

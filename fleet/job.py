@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from fleet.errors import check_coordinates
+from fleet.errors import check_coordinates, listed
 from fleet.surface import Surface
 
 Kind = Literal["pick_place", "hold", "press", "sort"]
@@ -96,7 +96,7 @@ def check_places(owner: object, kind: str, names: Sequence[str]) -> None:
     two = kind in ("pick_place", "sort")
     if len(names) != 1 + two or len(set(names)) != len(names):
         wanted = "two different places, from and to," if two else "one place"
-        raise ValueError(f"{type(owner).__name__}.places must be {wanted} for a {kind} (got {', '.join(names)}).")
+        raise ValueError(f"{type(owner).__name__}.places must be {wanted} for a {kind} (got {listed(names)}).")
 
 
 def shared_stations(alternatives: Sequence[Sequence[str]]) -> tuple[str, ...]:

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from rich.console import Group
 
 
-MOST_LABEL, LONGEST_WORD = 40, 12
-"""Characters on the terminal: of a row's label, so that a long name leaves room for the figures; and of a word of
-another column, up to which it is not broken."""
+MOST_LABEL, LONGEST_WORD, LEAST_TEXT = 40, 12, 24
+"""Characters on the terminal: of a row's label, so that a long name leaves room for the figures; of a word of another
+column, up to which it is not broken; and of a text that is shortened to fit into a line."""
 
 
 TABLE_FILES = (".csv", ".xlsx")
@@ -113,6 +113,38 @@ class Table:
             return tuple(cells[column] for column in columns)
 
         return replace(self, head=tuple(self.head[column] for column in columns), rows=tuple(map(of, self.rows)))
+
+    @property
+    def width(self) -> int:
+        """Characters of its longest line on a terminal that is wide enough."""
+        return sum(self._widths) + 2 * (len(self.head) - 1)
+
+    @property
+    def _widths(self) -> list[int]:
+        """Of each column, characters."""
+        from rich.cells import cell_len
+
+        columns = zip(self.headings, *self.rows, strict=True)
+        return [max(cell_len(visible(cell)) for cell in column) for column in columns]
+
+    def in_lines(self, width: int, leave_out: Sequence[str]) -> "Table":
+        """The table with one line for each row on a terminal.
+
+        The last column is shortened, then columns are left out, then the first one is shortened.
+
+        Args:
+            width: Of the terminal.
+            leave_out: Headings of the columns that may be left out, the first one first.
+        """
+        table, left_out = self, list(leave_out)
+        while left_out and table.width - max(0, table._widths[-1] - LEAST_TEXT) > width:
+            gone = left_out.pop(0)
+            table = table.select(*(i for i, name in enumerate(table.headings) if name != gone))
+        for column in (-1, 0):
+            most = max(table._widths[column] - max(0, table.width - width), LEAST_TEXT)
+            rows = (list(map(visible, row)) for row in table.rows)
+            table = replace(table, rows=tuple(_with_shorter(row, column, most) for row in rows))
+        return table
 
     def split(self) -> Iterator[tuple[str, "Table"]]:
         """Yield each group as a heading and a table without caption and notes."""
@@ -224,6 +256,15 @@ class Table:
         for index, row in enumerate(self.rows):
             group = [self.groups[index]] if index in self.groups else group
             yield (*group, *row)
+
+
+def _with_shorter(row: list[str], column: int, most: int) -> tuple[str, ...]:
+    """A row with at most so many characters in one column."""
+    from rich.cells import cell_len, set_cell_size
+
+    if cell_len(row[column]) > most:
+        row[column] = f"{set_cell_size(row[column], most - 1).rstrip()}…"
+    return tuple(row)
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

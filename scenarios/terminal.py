@@ -4,7 +4,7 @@ import os
 import textwrap
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from rich.text import Text
 from fleet.errors import FleetError, visible
 from fleet.files import cache_folder
 from scenarios.progress import COUNTED, Progress, StageClock, brief
+from scenarios.table import Table
 
 
 class SafeConsole(Console):
@@ -168,8 +169,19 @@ WIDE = 200
 
 def print_wide(table: RenderableType) -> None:
     """Print a table with many columns: in the width of the terminal, without one in `WIDE`."""
-    wide = out_console.is_terminal or "COLUMNS" in os.environ
-    (out_console if wide else SafeConsole(width=WIDE)).print(table)
+    (out_console if _has_width() else SafeConsole(width=WIDE)).print(table)
+
+
+def print_lines(table: Table, leave_out: Sequence[str]) -> None:
+    """Print a table with a line for each row: whole without a terminal, else as `Table.in_lines`."""
+    if _has_width():
+        out_console.print(table.in_lines(out_console.width, leave_out))
+    else:
+        SafeConsole(width=table.width).print(table)
+
+
+def _has_width() -> bool:
+    return out_console.is_terminal or "COLUMNS" in os.environ
 
 
 def say(sentence: str, console: Console = err_console) -> None:

@@ -93,6 +93,24 @@ def test_breaks_end_as_planned_where_a_failure_hides_their_end():
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("home_s", "breaks"),
+    [(250.0, [(250.0, 400.0)]), (450.0, []), (None, [])],
+    ids=["ends in the break", "lasts beyond the break", "lasts to the end"],
+)
+def test_a_break_begins_once_the_job_of_its_arm_has_ended(home_s, breaks):
+    """A job from 100 s on, a break of 200 to 400 s."""
+    log = [
+        Event(time_s=100.0, kind="award", arm="arm_0", job="a"),
+        Event(time_s=200.0, kind="break", arm="arm_0", value=200.0),
+        Event(time_s=400.0, kind="break_end", arm="arm_0"),
+    ]
+    if home_s:
+        log += [Event(time_s=home_s - 5.0, kind="finish", arm="arm_0", job="a", value=0.0)]
+        log += [Event(time_s=home_s, kind="home", arm="arm_0", job="a")]
+    assert [(each.start_s, each.end_s) for each in schedule(log, ARMS, HORIZON_S).breaks] == breaks
+
+
 @given(logs())
 def test_an_arm_is_in_one_place_at_a_time(log: tuple[list[Event], dict[str, int]]) -> None:
     result = schedule(log[0], ARMS, HORIZON_S)

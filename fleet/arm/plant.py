@@ -14,7 +14,7 @@ from fleet.engine.profile_plant import sample_row
 from fleet.engine.shift import StepRecord
 from fleet.engine.state import State
 from fleet.engine.world import World
-from fleet.errors import FleetError
+from fleet.errors import FleetError, listed
 from fleet.events import Event
 from fleet.heat.motor import friction_heat, reference_current
 from fleet.job import Fixture, Place
@@ -213,9 +213,7 @@ class MujocoPlant:
             ValueError: another step.
         """
         if record.tick.tolist() != [self._tick]:
-            raise ValueError(
-                f"MujocoPlant can read tick {self._tick} only (got {', '.join(map(str, record.tick.tolist()))})."
-            )
+            raise ValueError(f"MujocoPlant can read tick {self._tick} only (got {listed(record.tick.tolist())}).")
         faulted, cut_s = record.mode[0] == FAULTED, record.cut_s[0]
         braked = faulted | ((offsets_s[:, None] >= cut_s) & (cut_s < world.dt_s))  # [sample, arm]
         moments = self._sample_of(np.minimum(offsets_s[:, None], np.where(faulted, np.inf, cut_s)))

@@ -12,9 +12,10 @@ from typing import Protocol
 import numpy as np
 
 from fleet.bus.exchange.memory import Broadcast, Exchange, PeerView
+from fleet.engine import tables as event_numbers
 from fleet.engine.batch import Engine, Parts, RewardWeights, Shift, empty_parts
 from fleet.engine.state import State
-from fleet.engine.tables import AWARD, FAILURE, FAULT, GIVE_UP, RETURN, TRACE, EventBuffer
+from fleet.engine.tables import TRACE, EventBuffer
 from fleet.engine.world import World
 from fleet.events import Event, EventKind
 from fleet.motion import Drive
@@ -194,16 +195,17 @@ def events_of(world: World, state: State, buffer: EventBuffer) -> Iterator[Event
     what, numbers = buffer.what[:count], buffer.numbers[:count]
     began_s = (state.tick - 1) * world.dt_s
     # What becomes of the job follows the fault of its arm.
-    phase = np.where(np.isin(what[:, 0], (FAILURE, RETURN, GIVE_UP)), FAULT, what[:, 0])
+    of_fault = event_numbers.FAILURE, event_numbers.RETURN, event_numbers.GIVE_UP
+    phase = np.where(np.isin(what[:, 0], of_fault), event_numbers.FAULT, what[:, 0])
     for row in np.lexsort((what[:, 2], what[:, 1], phase)).tolist():
         kind, e, a, j, joint = what[row].tolist()
         offset_s, value = numbers[row].tolist()
-        plan, joint = (joint, -1) if kind == AWARD else (-1, joint)
+        plan, joint = (joint, -1) if kind == event_numbers.AWARD else (-1, joint)
         name, measured, reason = _described(world, state, kind, e, j, joint, value)
         common = {"time_s": float(began_s[e] + offset_s), "env": e, "arm": world.arms[a] if a >= 0 else ""}
         common["job"] = world.shifts[e].names[j] if j >= 0 else ""
         yield Event(kind=name, joint=joint + 1, value=measured, reason=reason, **common)
-        if kind == AWARD:
+        if kind == event_numbers.AWARD:
             peak, most = world.fleet[a].driven(world.plans[plan])[3], GEN3.torque_warning
             over = peak - np.array(most)
             if (over > 0).any():
@@ -219,36 +221,35 @@ def _described(
     """Name, value and reason of an event."""
     tables = world.tables
     match kind:
-        case 0:
+        case event_numbers.AWARD:
             return "award", value, ""
-        case 1:
+        case event_numbers.LOST:
             return "lost", math.nan, "another arm claimed it, its station or the space"
-        case 2:
+        case event_numbers.ILLEGAL:
             return "illegal", math.nan, "action outside the mask: a wait"
-        case 3:
+        case event_numbers.WARNING:
             return "warning", tables.warning_c, f"joint {joint + 1} passed {tables.warning_c:g} °C"
-        case 4:
+        case event_numbers.FINISH:
             late_s = max(0.0, float(state.finished_s[e, j] - world.shifts[e].due_s[j]))
             return "finish", late_s, f"late by {late_s:.0f} s" if late_s else "on time"
-        case 5:
+        case event_numbers.HOME:
             return "home", math.nan, ""
-        case 6:
+        case event_numbers.FAULT:
             return "fault", tables.error_c, f"joint {joint + 1} passed {tables.error_c:g} °C"
-        case 7:
-            return "return", value, f"{state.cycles[e, j]} of {state.repetitions[e, j]} cycles kept"
-        case 8:
+        case event_numbers.RETURN | event_numbers.GIVE_BACK:
+            kept = f"{state.cycles[e, j]} of {state.repetitions[e, j]} cycles kept"
+            return "return" if kind == event_numbers.RETURN else "give_back", value, kept
+        case event_numbers.GIVE_UP:
             return "give_up", value, f"{state.returns[e, j]} faults; {state.cycles[e, j]} cycles done"
-        case 10:
+        case event_numbers.MOVED:
             return "moved", math.nan, "moved home by a person"
-        case 11:
-            return "give_back", value, f"{state.cycles[e, j]} of {state.repetitions[e, j]} cycles kept"
-        case 12:
+        case event_numbers.EXPIRE:
             return "expire", math.nan, "its due date passed before an arm began it"
-        case 13:
+        case event_numbers.FAILURE:
             return "failure", value, f"not by heat; repaired after {value:.0f} s"
-        case 14:
+        case event_numbers.BREAK:
             return "break", value, f"for {value:.0f} s"
-        case 15:
+        case event_numbers.BREAK_END:
             return "break_end", math.nan, ""
         case _:
             return "recover", math.nan, f"every motor below {tables.restart_c:g} °C and the fault cleared"

@@ -15,6 +15,7 @@ import numpy as np
 from fleet.engine.batch import Engine, RewardWeights
 from fleet.engine.state import BROKEN, DONE, GIVEN_UP, RUNNING, State
 from fleet.engine.tables import Plans, Script, Tables
+from fleet.errors import listed
 from fleet.heat.thermal import HOUSING, WINDING
 from fleet.observation import Layout, Observation
 
@@ -144,7 +145,7 @@ def _check(schedules: Plans, discount: Array, rows: int, work: tuple[int, ...], 
     if len(shapes[0]) != 2 or shapes[0][1] != jobs or shapes[0][0] > rows or len(set(shapes)) != 1:
         raise ValueError(
             f"Schedules must be arrays [schedule, job] of at most {rows} schedules and {jobs} jobs, all of "
-            f"the same shape (got {', '.join(map(str, shapes))})."
+            f"the same shape (got {listed(shapes)})."
         )
     for name, values, most in (("arm", arm, work[2]), ("option", option, work[3])):
         if not np.issubdtype(values.dtype, np.integer) or (values < 0).any() or (values >= most).any():

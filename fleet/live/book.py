@@ -358,8 +358,8 @@ class JobBook(TimedState[BookRecord]):
         """Return the status of a job."""
         has = entry.grant is not None and not entry.grant.revoked and entry.state != "waiting"
         award = entry.award if (has or entry.state == "finished") and entry.award != NO_AWARD else ""
-        done = (entry.cycles, entry.finished_s, entry.reason)
-        return with_terms(JobStatus(entry.name, entry.state, entry.arm, award, *done), entry.spec)
+        status = JobStatus(entry.name, entry.state, entry.arm, award, entry.cycles, entry.finished_s, entry.reason)
+        return replace(with_terms(status, entry.spec), accepted_s=entry.accepted_s, shift_ended=entry.shift_ended)
 
     # Changes
 
@@ -416,7 +416,7 @@ class JobBook(TimedState[BookRecord]):
                 self.ended = True
                 changed = [self.jobs[name] for name in self.unsettled()]
                 for entry in changed:
-                    self._move(entry, "unfinished", entry.reason or SHIFT_ENDED)
+                    self._move(entry, "waiting", entry.reason)
             case SpaceTaken():
                 self.space[record.arm] = frozenset(record.space)
             case SpaceCleared(arm):
@@ -450,7 +450,7 @@ class JobBook(TimedState[BookRecord]):
                 continue
             del self._unknown[job.name]
             entry.spec, entry.by, self._in_order = self.operations.changed(job), record.by, None
-            entry.submitted = job if entry.spec != job else None
+            entry.submitted, entry.accepted_s = job if entry.spec != job else None, record.time_s
             if entry.state == "waiting":
                 self._move(entry, "waiting", entry.reason)
             new.append(entry)
@@ -703,9 +703,9 @@ class JobBook(TimedState[BookRecord]):
 
     def _move(self, entry: JobEntry, state: JobState, reason: str = "") -> None:
         """Change the state of a job."""
-        if state == "waiting" and self.ended:
-            known = entry.reason if entry.state == "unfinished" else reason
-            state, reason = "unfinished", known or SHIFT_ENDED
+        entry.shift_ended = state == "waiting" and self.ended
+        if entry.shift_ended:
+            state, reason = "unfinished", (entry.reason if entry.state == "unfinished" else reason) or SHIFT_ENDED
         self.waiting.pop(entry.name, None)
         self._unsettle(entry)
         entry.state, entry.reason = state, reason

@@ -16,6 +16,7 @@ from msgspec.structs import replace
 from fleet.bus.protocol.auction import MOST_JOBS, SETTLED, Admission, JobSpec, JobStatus, Status
 from fleet.bus.protocol.messages import LISTED_BYTES, State, encode
 from fleet.bus.protocol.operator import Change
+from fleet.errors import listed
 
 MAX_OPEN_JOBS = 10_000
 """Jobs of one auctioneer that are neither finished nor given up; more are refused."""
@@ -151,7 +152,7 @@ def admit(
         elif same_name is not None or job.name in past:
             rejected[index] = f"Another job has the name '{job.name}'; names must be unique."
         elif unknown:
-            rejected[index] = f"No place '{unknown[0]}' in this cell. Places: {', '.join(sorted(places or ()))}."
+            rejected[index] = f"No place '{unknown[0]}' in this cell. Places: {listed(sorted(places or ()))}."
         elif count + len(new) >= limit:
             rejected[index] = f"There are {limit} open jobs already; submit it again when some are finished."
         else:
@@ -303,6 +304,11 @@ def with_terms(status: JobStatus, job: JobSpec | None) -> JobStatus:
     if job is None:
         return status
     return replace(status, repetitions=job.repetitions, due_s=job.due_s, value=job.value, release_s=job.release_s)
+
+
+def waits_since_s(status: JobStatus) -> float | None:
+    """Return the fleet time since which an arm may begin a job: its release or acceptance; None for unknown."""
+    return max((each for each in (status.release_s, status.accepted_s) if each is not None), default=None)
 
 
 def finish_s(status: JobStatus, state: State | None) -> float | None:

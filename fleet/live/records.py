@@ -171,6 +171,10 @@ class JobEntry(msgspec.Struct):
     """The arm of each fault in this job, by award."""
     settled_s: float | None = None
     """Fleet time at which it was finished or given up."""
+    accepted_s: float | None = None
+    """Fleet time at which it was accepted; None while only its name is known."""
+    shift_ended: bool = False
+    """It is unfinished only because the shift has ended."""
 
     @property
     def original(self) -> JobSpec | None:

@@ -16,7 +16,7 @@ from fleet.bus.protocol.operator import (
     Resume,
     Settle,
 )
-from fleet.errors import Refused
+from fleet.errors import Refused, listed
 from fleet.live.book import JobBook
 from fleet.live.job_rules import changed_spec, content_hash
 from fleet.live.leases import progress
@@ -92,7 +92,7 @@ def objection(book: JobBook, request: ControlRequest, arms: Set[str]) -> str:
 
 def _check_arm(book: JobBook, arm: str, arms: Set[str]) -> None:
     if arm != ALL_ARMS and not any(arm in names for names in (arms, book.space, book.operations.paused)):
-        raise Refused(f"There is no arm '{arm}'. Arms: {', '.join(sorted(arms)) or 'none'}; '*' for all.")
+        raise Refused(f"There is no arm '{arm}'. Arms: {listed(sorted(arms))}; '*' for all.")
 
 
 def _objection_to_job(book: JobBook, action: Cancel | Settle | Change) -> str:

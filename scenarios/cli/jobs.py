@@ -10,7 +10,7 @@ from fleet.fields import argument, option
 from fleet.job import BOUNDS, DWELL_S
 from scenarios.cli import options
 from scenarios.table import Table
-from scenarios.terminal import print_either, say
+from scenarios.terminal import print_json, print_lines, say
 
 if TYPE_CHECKING:  # the bus, which other commands do not load
     from fleet.bus.protocol.auction import JobStatus
@@ -96,15 +96,17 @@ def list_command(
 ) -> None:
     """List jobs of a fleet by name: state, arm, cycles, age, due date, end and reason.
 
-    The age counts from the release. The end is the predicted one of a job that
-    an arm has, and the true one of a finished job. A job is late if it ends
-    after its due date, or waits beyond it.
+    The age counts from the release, or from the acceptance if that is later.
+    The end is the predicted one of a job that an arm has, and the true one of a
+    finished job. A job is late if it ends after its due date, or waits beyond
+    it. A terminal that is too narrow for all columns shows some of them.
     """
     import time
 
     from fleet.bus.client import BusClient, NoReply
     from fleet.bus.protocol import keys
     from fleet.bus.protocol.auction import ABANDONED, SETTLED, Status, StatusRequest
+    from fleet.live.job_rules import waits_since_s
     from fleet.live.monitor.snapshot import FleetListener
     from scenarios.cli.options import the_fleet
     from scenarios.show.words import clock, duration
@@ -114,20 +116,22 @@ def list_command(
         listener.serve(time.monotonic() + LISTEN_S)
         snapshot = listener.view.snapshot(time.monotonic())
         known = {job.job: job for job in snapshot.jobs if not names or job.job in names}
+        now_s = max((arm.time_s or 0.0 for arm in snapshot.arms), default=0.0)
         with suppress(NoReply, Refused):  # results tell neither predicted ends nor why jobs wait
             asked = StatusRequest(tuple(names or ()))
             now = link.ask(keys.of_jobs(link.fleet, "status"), asked, Status, timeout_s=LISTEN_S)
             known |= {job.job: job for job in now.jobs}
+            now_s = max(now_s, now.time_s)
     jobs = sorted(known.values(), key=lambda status: status.job)
     if unknown := sorted({*(names or ())} - {job.job for job in jobs}):
         near = nearest(unknown[0], [job.job for job in snapshot.jobs])
         raise FleetError(f"The fleet knows no job '{unknown[0]}'{near}")
-    now_s = max((arm.time_s or 0.0 for arm in snapshot.arms), default=0.0)
 
     def row(job: "JobStatus") -> tuple[str, ...]:
         end_s = job.finish_s if job.finished_s is None else job.finished_s
-        is_open = job.release_s is not None and job.state not in SETTLED and now_s > job.release_s
-        age = duration(now_s - (job.release_s or 0.0)) if is_open else ""
+        since_s = waits_since_s(job)
+        is_open = since_s is not None and job.state not in SETTLED and now_s > since_s
+        age = duration(now_s - (since_s or 0.0)) if is_open else ""
         cycles, end = f"{job.cycles} of {job.repetitions}", "" if end_s is None else clock(end_s)
         due = "" if job.due_s is None else clock(job.due_s)
         late_s = 0.0 if job.due_s is None or job.state in ABANDONED else (now_s if end_s is None else end_s) - job.due_s
@@ -135,7 +139,11 @@ def list_command(
         return job.job, job.state.replace("_", " "), job.arm, cycles, age, due, end, job.reason
 
     head = ("job", "state", "arm", "cycles", "age", "due", "end", "reason")
-    print_either(as_json, jobs, Table(head=head, rows=tuple(map(row, jobs)), numbers=False))
+    table = Table(head=head, rows=tuple(map(row, jobs)), numbers=False)
+    if as_json:
+        print_json(jobs)
+    else:
+        print_lines(table, ("cycles", "end", "age", "due"))
 
 
 def cancel_command(

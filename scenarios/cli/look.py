@@ -154,7 +154,8 @@ def _list_library(as_json: bool) -> None:
 def layout_command(
     scenario: str = options.SCENARIO,
     out: Path | None = option(
-        "Draw the plan of the cell as this PNG file: reach, places out of reach, and exclusions.", None
+        "Draw the plan of the cell: reach, places out of reach and, as .png, exclusions; as .html, arms can be moved.",
+        None,
     ),
     overwrite: bool = options.OVERWRITE,
     as_json: bool = options.JSON,
@@ -171,7 +172,7 @@ def layout_command(
     from scenarios.spec.parse import parse_cell
 
     if out is not None:
-        check_file(out, (".png",), overwrite)
+        check_file(out, (".png", ".html"), overwrite)
     wrong = ""
     try:
         chosen = load(scenario)
@@ -190,10 +191,13 @@ def layout_command(
         report = replace(report, problems=(wrong, *(each for each in report.problems if not each.startswith(own))))
     print_either(as_json, report, *layout_parts(chosen, report))
     if out is not None:
-        from scenarios.show.plan import draw_plan
+        from scenarios.show.plan import draw_plan, plan_page
 
         with new_file(out) as file:
-            draw_plan(file, chosen, report)
+            if out.suffix.lower() == ".html":
+                file.write_text(plan_page(chosen, report), encoding="utf-8")
+            else:
+                draw_plan(file, chosen, report)
         say(f"Drew the cell: {out}.")
     for problem in report.problems:
         say(f"Error: {problem}")

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from scenarios.progress import Progress
     from twin.logs.recording import Recording
     from twin.thermal.identify import Identified
-    from twin.vae.twin import Twin
 
 KNOWN_TWINS = option("A folder of twins. Default: those of the scenario, from the cache.", None, flag="--twins")
 SEED = option("Random seed.", 0, low=0, high=MAX_SEED)
@@ -186,17 +185,18 @@ def subject_of(
     from scenarios.prepare.twins import open_twin
     from scenarios.spec.load import load
 
+    chosen = None if scenario is None else load(scenario)
+    spec = None if chosen is None else chosen.arms[0 if arm is None else chosen.index_of(arm)]
+    twin = None if twins is None else open_twin(twins, arm if spec is None else spec.name)
     identified = network_of(network)
-    if scenario is None:
-        if twins is None or identified is None:
+    if chosen is None or spec is None:
+        if twin is None or identified is None:
             raise FleetError("Give a SCENARIO, or --twins and --network of an arm that is known by its logs.")
-        logged = logged_arm(open_twin(twins, arm), identified, tilt, tool_kg)
+        logged = logged_arm(twin, identified, tilt, tool_kg)
         return logged.arm.robot, (), lambda progress: logged
     if tilt != "0,0,0" or tool_kg:
         raise FleetError("--tilt and --tool are for an arm without a scenario; a scenario states them.")
-    chosen = load(scenario)
-    spec = chosen.arms[0 if arm is None else chosen.index_of(arm)]
-    models = {"twin": twin_of(twins, spec.name), "network": identified}
+    models = {"twin": twin, "network": identified}
     return spec.robot(), chosen.fixtures, lambda progress: known_arm(chosen, spec.name, **models, progress=progress)
 
 
@@ -315,13 +315,6 @@ def export_command(
 
     twin = open_twin(twins, arm)
     say(f"Twin of {twin.arm}, version {twin.version}, written to {export_onnx(twin, out, precision)}.", out_console)
-
-
-def twin_of(folder: Path | None, arm: str) -> "Twin | None":
-    """The stored twin of an arm; None without a folder."""
-    from scenarios.prepare.twins import open_twin
-
-    return None if folder is None else open_twin(folder, arm)
 
 
 def network_of(folder: Path | None) -> "Identified | None":

@@ -4,6 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
+from fleet.live.job_rules import waits_since_s
 from fleet.live.monitor.health import reason_class
 from fleet.live.monitor.snapshot import FleetSnapshot
 
@@ -11,7 +12,10 @@ CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 METRICS: Mapping[str, tuple[str, str]] = {
     "jobs": ("gauge", "Jobs by state."),
     "waiting_jobs": ("gauge", "Waiting jobs by class of reason."),
-    "oldest_waiting_seconds": ("gauge", "Fleet seconds since the release of the oldest waiting job; 0 without one."),
+    "oldest_waiting_seconds": (
+        "gauge",
+        "Fleet seconds for which the oldest released job waits; 0 without one.",
+    ),
     "bids": ("gauge", "Open jobs for which an arm has a bid."),
     "arm_events_total": (
         "counter",
@@ -57,8 +61,8 @@ def samples(fleet: FleetSnapshot, alarms: Counter[tuple[str, str]]) -> Iterable[
         yield "waiting_jobs", {"reason": reason}, count
     now_s = max((arm.time_s for arm in fleet.arms if arm.time_s is not None), default=None)
     if now_s is not None:
-        released = [now_s - status.release_s for status in waiting if status.release_s is not None]
-        yield "oldest_waiting_seconds", {}, max([0.0, *released])
+        since_s = [since_s for status in waiting if (since_s := waits_since_s(status)) is not None]
+        yield "oldest_waiting_seconds", {}, max(0.0, now_s - min(since_s, default=now_s))
     for arm in fleet.arms:
         own = {"arm": arm.arm}
         yield "bids", own, len(arm.scores)

@@ -82,7 +82,7 @@ class Schedule:
     outages: tuple[Outage, ...]
     horizon_s: float
     breaks: tuple[Outage, ...] = ()
-    """An arm may still finish a cycle or a job in them."""
+    """Each from when the arm is home from the job that it had when the break began."""
 
     def at(self, arm: str, time_s: float, job: str = "") -> JobSpan | None:
         """The work of an arm at a time; with a job, only that one."""
@@ -112,9 +112,10 @@ def schedule(events: Sequence[Event], arms: Sequence[str], horizon_s: float) -> 
     breaks: list[Outage] = []
     for arm, log in own.items():
         log.sort(key=lambda e: (round(e.time_s, SAME_MOMENT_DIGITS), _ORDER.index(e.kind)))
-        assignments += _assignments(arm, log, horizon_s)
+        work = _assignments(arm, log, horizon_s)
+        assignments += work
         outages += _outages(arm, log, horizon_s)
-        breaks += _breaks(arm, log, horizon_s)
+        breaks += _breaks(arm, log, work, horizon_s)
     return Schedule(tuple(assignments), tuple(outages), horizon_s, tuple(breaks))
 
 
@@ -214,10 +215,11 @@ def _outages(arm: str, log: Sequence[Event], horizon_s: float) -> list[Outage]:
     ]
 
 
-def _breaks(arm: str, log: Sequence[Event], horizon_s: float) -> list[Outage]:
+def _breaks(arm: str, log: Sequence[Event], work: Sequence[JobSpan], horizon_s: float) -> list[Outage]:
     """Breaks of one arm, from its events in order; the log of one that began before may lack its begin.
 
-    The end of a break may be missing, too, if the arm failed meanwhile; it has the planned one then.
+    The end of a break may be missing, too, if the arm failed meanwhile; it has the planned one then. A break in which
+    the arm is at work throughout is left out.
     """
     begins = [(event.time_s, event.time_s + event.value) for event in log if event.kind == "break"]
     ends = [event.time_s for event in log if event.kind == "break_end"]
@@ -227,8 +229,10 @@ def _breaks(arm: str, log: Sequence[Event], horizon_s: float) -> list[Outage]:
     for begin_s, planned_s in begins:
         planned_s = planned_s if isfinite(planned_s) else horizon_s
         end_s = min((each for each in (*ends, planned_s) if each > begin_s), default=begin_s)
-        over = end_s <= horizon_s
-        out.append(Outage(arm=arm, start_s=begin_s, end_s=min(end_s, horizon_s), kind="break", recovered=over))
+        over, end_s = end_s <= horizon_s, min(end_s, horizon_s)
+        free_s = max((span.end_s for span in work if span.start_s < begin_s), default=0.0)
+        if free_s < end_s:
+            out.append(Outage(arm=arm, start_s=max(begin_s, free_s), end_s=end_s, kind="break", recovered=over))
     return out
 
 

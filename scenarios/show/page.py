@@ -131,6 +131,8 @@ class Page:
     """Values of the template."""
     charts: Sequence[Chart] = ()
     replay: Playback | None = None
+    plan: Mapping[str, Any] | None = None
+    """Cell that `layout.js` draws; Any: values of JSON."""
     narrow: bool = False
     """For text; the default width is for figures over a shift."""
 
@@ -149,6 +151,8 @@ class Page:
         if self.charts:
             data["plotly"] = _plotly_js()
             data |= {chart.key: _json(chart.figure) for chart in self.charts}
+        if self.plan:
+            data["layout"] = _json(self.plan)
         if self.replay:
             data |= {"three": _packed_three_js(), "cell-model": _json(self.replay.model)}
             data |= {f"playback-{number}": shift for number, shift in enumerate(self.replay.shifts)}
@@ -158,11 +162,13 @@ class Page:
         """The scripts, and the function that begins; the replay comes first, since a figure takes longer."""
         replay = self.replay
         code = [static(name) for name in ("unpack.js", "figure.js", *(("cell.js", "replay.js") if replay else ()))]
+        code += [static("layout.js")] if self.plan else []
         begin = f"startReplay({replay.unit_s},{json.dumps(replay.clock)})" if replay else ""
         play = f'await runLibrary("three");const shift=await {begin};' if replay else ""
         draw = f"const figure=await drawFigures({json.dumps(_PLOTLY_OPTIONS)});" if self.charts else ""
         join = "shift.attach(figure);" if replay and self.charts else ""
-        start = f'async function start(){{startFilters();{play}{draw}{join}document.body.dataset.ready="all";}}'
+        plan = "startLayout();" if self.plan else ""
+        start = f'async function start(){{startFilters();{plan}{play}{draw}{join}document.body.dataset.ready="all";}}'
         failed = "start().catch((error)=>{document.title+=' (incomplete)';console.error(error);});"
         return f"{''.join(code)}\n{start}\n{failed}"
 

@@ -17,11 +17,13 @@ from fleet.env.render.picture import FAULT, INK, outlines
 from fleet.env.render.scene import mount_kind
 from scenarios.show.comparison_page import COLOURS
 from scenarios.show.layout import LayoutReport, shoulder_m
+from scenarios.show.page import Page
 from scenarios.spec.schema import Scenario
 
 Array = np.ndarray
 MOST_NAMED, MOST_NUMBERS, MOST_ROWS = 16, 24, 40
 """Arms whose mounts are described; rows of a matrix of exclusions with numbers; rows of the largest matrix drawn."""
+LEGEND = "reach {:.2f} m above the floor: dashed outstretched, filled with the tool pointing down"
 LETTERS = 170
 """Of a line of problems, in a picture of full width."""
 
@@ -46,6 +48,50 @@ def draw_plan(file: Path, scenario: Scenario, report: LayoutReport) -> None:
     figure.set_layout_engine("none")
     _write_labels(axes, labels)
     figure.savefig(file, format="png", bbox_inches="tight")
+
+
+def plan_page(scenario: Scenario, report: LayoutReport) -> str:
+    """The plan of a cell as a page on which arms are moved and turned, as HTML."""
+    height_m, arms = _height_m(scenario), list[dict[str, Any]]()
+    for i, spec in enumerate(scenario.arms):
+        robot = spec.robot()
+        shoulder = shoulder_m(robot)
+        points = {"shoulder": shoulder - spec.position_m, "ahead": _ahead_m(robot.mount.rotation())[:2]}
+        arms.append(
+            {
+                "name": spec.name,
+                "colour": COLOURS[i % len(COLOURS)],
+                "base": spec.position_m,
+                "tilt": spec.tilt_deg,
+                "radii": _radii_m(shoulder, height_m),
+                **{name: each.tolist() for name, each in points.items()},
+            }
+        )
+    plan = {
+        "reach_m": REACH_M,
+        "arms": arms,
+        "places": [{"name": place.name, "at": place.position_m} for place in scenario.places],
+        "fixtures": [outline.tolist() for fixture in scenario.fixtures for outline in outlines(fixture)],
+    }
+    content = {"legend": f"The {LEGEND.format(height_m)}.", "problems": report.problems}
+    return Page(title=f"Plan of {scenario.name}", template="layout.html", content=content, plan=plan).html()
+
+
+def _height_m(scenario: Scenario) -> float:
+    """Mean height of the places, at which reach is drawn."""
+    return float(np.mean([place.position_m[2] for place in scenario.places])) if scenario.places else 0.0
+
+
+def _radii_m(shoulder: Array, height_m: float) -> tuple[float, float]:
+    """Radius of an arm's reach at a height, with the tool pointing down and outstretched."""
+    reach = np.array([UPPER_ARM_M + FOREARM_M, REACH_M])
+    down, stretched = np.sqrt(np.maximum(0.0, reach**2 - (height_m + np.array([HAND_M, 0.0]) - shoulder[2]) ** 2))
+    return float(down), float(stretched)
+
+
+def _ahead_m(turn: Array) -> Array:
+    """An arrow from the base of a mount with this rotation, [3]."""
+    return 0.18 * (turn[:, 0] if abs(turn[2, 0]) < 0.9 else turn[:, 2])
 
 
 @dataclass(frozen=True)
@@ -86,22 +132,19 @@ def _write_labels(axes: Axes, labels: Sequence[Label]) -> None:
 def _draw_cell(axes: Axes, scenario: Scenario, report: LayoutReport) -> list[Label]:
     """The cell from above, x to the right and y up; returns the names of arms and places, to be written."""
     labels = list[Label]()
-    height_m = float(np.mean([place.position_m[2] for place in scenario.places])) if scenario.places else 0.0
+    height_m = _height_m(scenario)
     for outline in (each for fixture in scenario.fixtures for each in outlines(fixture)):
         axes.add_patch(Polygon(outline, facecolor="#e4e0d8", edgecolor="#c9c9c9", zorder=0))
     at = {place.name: place.position_m for place in scenario.places}
     for i, spec in enumerate(scenario.arms):
         robot, colour = spec.robot(), COLOURS[i % len(COLOURS)]
         base, shoulder, turn = np.array(spec.position_m), shoulder_m(robot), robot.mount.rotation()
-        for radius_m, above_m, look in (
-            (UPPER_ARM_M + FOREARM_M, HAND_M, {"facecolor": (colour, 0.10), "edgecolor": "none"}),
-            (REACH_M, 0.0, {"fill": False, "edgecolor": colour, "linestyle": "--"}),
-        ):
-            cut_m = np.sqrt(max(0.0, radius_m**2 - (height_m + above_m - shoulder[2]) ** 2))
-            axes.add_patch(Circle((shoulder[0], shoulder[1]), cut_m, zorder=1, **look))
+        down, stretched = {"facecolor": (colour, 0.10), "edgecolor": "none"}, {"edgecolor": colour, "linestyle": "--"}
+        for radius_m, look in zip(_radii_m(shoulder, height_m), (down, stretched | {"fill": False}), strict=True):
+            axes.add_patch(Circle((shoulder[0], shoulder[1]), radius_m, zorder=1, **look))
         axes.plot(*np.stack([base, shoulder])[:, :2].T, color=colour, linewidth=6, solid_capstyle="round", zorder=3)
         axes.plot(*base[:2], marker="s", color=colour, markersize=9, zorder=3)
-        ahead = base + 0.18 * (turn[:, 0] if abs(turn[2, 0]) < 0.9 else turn[:, 2])
+        ahead = base + _ahead_m(turn)
         axes.annotate("", tuple(ahead[:2]), tuple(base[:2]), arrowprops={"arrowstyle": "-|>", "color": INK}, zorder=4)
         able = any(each.payload_kg is not None for each in report.reach if each.arm == spec.name)
         text = spec.name if able else f"{spec.name}: can do no job"
@@ -125,8 +168,7 @@ def _draw_cell(axes: Axes, scenario: Scenario, report: LayoutReport) -> list[Lab
     axes.set_aspect("equal")
     axes.autoscale_view()
     axes.grid(color="#e6e6e6", zorder=-1)
-    legend = f"reach {height_m:.2f} m above the floor: dashed outstretched, filled with the tool pointing down"
-    axes.set(xlabel=f"x, m\n{legend}", ylabel="y, m")
+    axes.set(xlabel=f"x, m\n{LEGEND.format(height_m)}", ylabel="y, m")
     axes.set_title(f"{scenario.name}: {len(report.at_once)} of {len(scenario.arms)} arms can work at once (lines)")
     return labels
 

@@ -28,7 +28,7 @@ STREAM_COLOURS = ("#4477aa", "#ddaa33", "#228833", "#aa4499", "#66ccee", "#99775
 FAULT, WARNING, FAILURE, BREAK = "#cc2222", "#e08a00", "#444444", "#8a8a8a"
 BAR = {"type": "bar", "orientation": "h", "legend": "legend"}
 BAR_HEIGHT, BREAK_HEIGHT = 0.62, 0.24
-"""In rows; an arm may work in a break."""
+"""In rows; a fault may last into a break."""
 LATE = {"color": INK, "width": 1.6}
 HATCH = {"fillmode": "overlay", "fgcolor": "white", "fgopacity": 1.0, "size": 7, "solidity": 0.35}
 ARM_NAME, STREAM_NAME = 16, 30

@@ -21,8 +21,8 @@ from scenarios.spec.job_table import DAY_S, seconds_of, since
 from scenarios.spec.schema import MOST_BREAKS, Scenario
 
 WEEKDAYS = ("monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday")
-LONGEST_NIGHT_S = 43_200.0
-"""Longest break from one day to the next: a longer one has its begin and end exchanged."""
+DAY, LONGEST_NIGHT = timedelta(days=1), timedelta(hours=12)
+"""The end of a day, and the longest break beyond it: a longer one has its begin and end exchanged."""
 FAILURES = 3
 """Child of the seed of a shift that samples the failures of its arms."""
 _ROUNDING = 1e-9
@@ -103,13 +103,13 @@ def _break_times(
         yield entry | {"begin_s": first_s, "end_s": last_s}
         return
     first, last = (_clock(given[name], f"{where}.{name}") for name in ("begin", "end"))
-    to_midnight = (last == time() and first != last) or str(given["end"]).startswith("24:")
-    night_s = _since_midnight_s(last) + DAY_S - _since_midnight_s(first)
-    if last <= first and night_s > LONGEST_NIGHT_S and not to_midnight:
+    if next_day := last <= first:
+        last += DAY
+    if next_day and (not timedelta() < last - first < DAY or (last - first > LONGEST_NIGHT and last != DAY)):
         raise ScenarioError(f"{where}: it ends at {given['end']}, before it begins at {given['begin']}.")
     found, touched = list[dict[str, Any]](), False
     for day_s, date in _days(given.get("weekdays", list(WEEKDAYS)), begin, horizon_s, f"{where}.weekdays"):
-        begin_s, end_s = day_s(date, first), day_s(date + timedelta(days=last <= first), last)
+        begin_s, end_s = day_s(date, first), day_s(date, last)
         touched |= end_s > 0 and begin_s < horizon_s
         if end_s > max(0.0, begin_s) and begin_s < horizon_s:  # not within the hour that summer time leaves out
             found.append(entry | {"begin_s": begin_s, "end_s": end_s})
@@ -153,8 +153,8 @@ def _days(given: object, begin: datetime | None, horizon_s: float, where: str) -
         if name not in WEEKDAYS:
             raise ScenarioError(f"{where}: there is no day '{printable(str(name))}'{nearest(str(name), WEEKDAYS)}")
 
-    def since_begin(date: datetime, clock: time) -> float:
-        return since(begin, datetime.combine(date, clock, begin.tzinfo))
+    def since_begin(date: datetime, clock: timedelta) -> float:
+        return since(begin, (date + clock).replace(tzinfo=begin.tzinfo))
 
     for day in range(-1, ceil(horizon_s / DAY_S) + 1):
         date = datetime.combine(begin.date() + timedelta(days=day), time())
@@ -167,21 +167,16 @@ def _is_clock(given: object) -> bool:
     return isinstance(given, time) or re.fullmatch(r"\d{1,2}:\d{2}(:\d{2})?", str(given)) is not None
 
 
-def _since_midnight_s(clock: time) -> float:
-    return clock.hour * 3600.0 + clock.minute * 60.0 + clock.second
-
-
-def _clock(given: object, where: str) -> time:
-    """A time of day; 24:00 is 0:00 of the next."""
-    if isinstance(given, time):
-        return given
+def _clock(given: object, where: str) -> timedelta:
+    """A time of day, by the clock since midnight; up to 24:00."""
     if str(given) in ("24:00", "24:00:00"):
-        return time()
+        return DAY
     try:
         hours, _, rest = str(given).partition(":")
-        return time.fromisoformat(f"{hours:0>2}:{rest}")
+        clock = given if isinstance(given, time) else time.fromisoformat(f"{hours:0>2}:{rest}")
     except ValueError as error:
         raise ScenarioError(f"{where}: expected a time of day, as '6:00' (got {given!r}).") from error
+    return timedelta(hours=clock.hour, minutes=clock.minute, seconds=clock.second, microseconds=clock.microsecond)
 
 
 def check_breaks(scenario: Scenario, file: str) -> None:

@@ -21,7 +21,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import msgspec
 import numpy as np
 
-from fleet.errors import ScenarioError, nearest, printable
+from fleet.errors import ScenarioError, listed, nearest, printable
 from scenarios.spec.calendar import check_breaks, with_calendar, zone_of
 from scenarios.spec.job_table import cycle_of, read_bytes, read_job_table, shift_begin, stream_fields, text_of
 from scenarios.spec.mesh_file import with_meshes
@@ -228,7 +228,7 @@ def _with_tables(raw: Mapping[str, object], path: Path) -> Mapping[str, object]:
             continue
         where = f"{path.name}: jobs[{i}]"
         if len(each) > 1 or not isinstance(each["table"], str):
-            raise ScenarioError(f'{where}: a job table is table = "FILE", without other keys (got {", ".join(each)}).')
+            raise ScenarioError(f'{where}: a job table is table = "FILE", without other keys (got {listed(each)}).')
         file = path.parent / each["table"]
         where = f"{where}.table: '{file.name}'"
         try:

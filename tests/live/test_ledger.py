@@ -201,6 +201,23 @@ def test_after_the_end_of_the_shift_no_job_is_ready():
     assert book.status(["a", "unknown"])[0].state == "finished"
 
 
+def test_the_end_of_a_shift_marks_the_jobs_that_are_known_to_be_undone():
+    """`unsure`: its arm falls silent in its last cycle, at the end of the shift."""
+    book = ledger(spec("waits"), spec("back", place="bin"), spec("unsure", place="belt"), spec("late", place="box"))
+    for name in ("back", "unsure", "late"):
+        book.apply(award(name))
+    book.apply(closed("0:back", "returned", 1, 3.0, "an arm faulted"))
+    book.apply(CommitPermitted("0:unsure", 4.0))
+    assert not any(status.shift_ended for status in book.status())
+    book.apply(ShiftEnded(7200.0))
+    book.apply(closed("0:late", "returned", 1, 7201.0, "an arm faulted"))
+    book.apply(ContactLost("0:unsure", 7202.0))
+    for each in (book, JobBook().replay([*book.compact()])):
+        assert {s.job for s in each.status() if s.shift_ended} == {"waits", "back", "late"}
+    book.apply(closed("0:unsure", "returned", 1, 7203.0))
+    assert book.status(["unsure"])[0].shift_ended
+
+
 steps = st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 9)), max_size=25)
 
 

@@ -48,10 +48,16 @@ def hours(scenario: Scenario) -> list[tuple[float, float]]:
         ("6:00", "7:00", {"shift_begin": "2026-03-29T00:00+01:00", "time_zone": "Europe/Berlin"}, (5.0, 6.0)),
         ("6:00", "7:00", {"shift_begin": "2026-10-25T00:00+02:00", "time_zone": "Europe/Berlin"}, (7.0, 8.0)),
         ("22:00", "24:00", {"shift_begin": "2026-11-23T06:00Z"}, (16.0, 18.0)),
+        ("8:00", "24:00", {"shift_begin": "2026-11-23T06:00Z"}, (2.0, 18.0)),
+        ("8:00", "0:00", {"shift_begin": "2026-11-23T06:00Z"}, (2.0, 18.0)),
+        ("24:00", "5:00", {"shift_begin": "2026-11-23T06:00Z"}, (18.0, 23.0)),
+        ("24:00", "5:00", {"shift_begin": "2026-11-23T06:00Z", "weekdays": ["monday"]}, (18.0, 23.0)),
     ],
 )  # fmt: skip
 def test_a_break_has_the_times_that_are_meant(begin, end, fields, expected) -> None:
-    assert hours(with_breaks({"name": "lunch", "begin": begin, "end": end}, **fields)) == [expected]
+    days = {name: value for name, value in fields.items() if name == "weekdays"}
+    fields = {name: value for name, value in fields.items() if name not in days}
+    assert hours(with_breaks({"name": "lunch", "begin": begin, "end": end, **days}, **fields)) == [expected]
 
 
 @pytest.mark.parametrize(
@@ -138,6 +144,14 @@ BREAK = {"name": "lunch", "begin": "4:00", "end": "5:00"}
         (
             {"breaks": [BREAK | {"begin": "11:30", "end": "11:00"}], "shift_begin": "2026-11-23T06:00Z"},
             r"breaks\[0\]: it ends at 11:00, before it begins at 11:30",
+        ),
+        (
+            {"breaks": [BREAK | {"begin": "24:00", "end": "0:00"}], "shift_begin": "2026-11-23T06:00Z"},
+            r"breaks\[0\]: it ends at 0:00, before it begins at 24:00",
+        ),
+        (
+            {"breaks": [BREAK | {"begin": "0:00", "end": "0:00"}], "shift_begin": "2026-11-23T06:00Z"},
+            r"breaks\[0\]: it ends at 0:00, before it begins at 0:00",
         ),
         ({"time_zone": "Europe/Berln"}, "there is no time zone 'Europe/Berln'; give a name as Europe/Berlin"),
         (

@@ -591,6 +591,26 @@ def test_jobs_can_be_followed_to_their_end(endpoint, tmp_path, thermofleet, end,
     assert said[:2] == (code, f"a: accepted\na: waiting\na: awarded to arm_0\na: {end} {link} arm_0\n")
 
 
+def test_a_list_of_jobs_has_a_line_for_each_and_ages_since_their_acceptance(endpoint, thermofleet, monkeypatch):
+    """At 3600 s; `new` was accepted at 3480 s, `planned` at 60 s for 3000 s."""
+    why = "It waits until the_arm_beside_the_belt is out of the way."
+    jobs = (
+        JobStatus("new", "waiting", reason=why, repetitions=12, due_s=3000.0, release_s=0.0, accepted_s=3480.0),
+        JobStatus("planned", "waiting", reason=why, repetitions=12, release_s=3000.0, accepted_s=60.0),
+    )
+    declared = (keys.of_jobs("f", "status"), StatusRequest, lambda _: Status("auctioneer", 3600.0, jobs))
+    listed = ("job", "list", "--endpoint", endpoint, "--fleet", "f")
+    with served(endpoint, lambda bus: bus.reply_to(*declared)):
+        monkeypatch.delenv("COLUMNS", raising=False)
+        _, new, planned = thermofleet(*listed)[1].splitlines()  # in a pipe
+        monkeypatch.setenv("COLUMNS", "80")
+        _, *narrow = thermofleet(*listed)[1].splitlines()
+    assert " ".join(new.split()) == f"new waiting 0 of 12 2 min 0:50:00, 10 min late {why}"
+    assert " ".join(planned.split()) == f"planned waiting 0 of 12 10 min {why}"
+    assert [line.split()[:2] for line in narrow] == [["new", "waiting"], ["planned", "waiting"]]
+    assert all(len(line) <= 80 and "It waits until the_arm" in line for line in narrow)
+
+
 def test_ask_shows_the_cost_of_a_job_for_each_arm(endpoint, thermofleet):
     job = ("--kind", "hold", "--place", "rack", "--payload", "2")
     with arm(endpoint) as asked:

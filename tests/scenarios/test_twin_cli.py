@@ -5,6 +5,8 @@ import io
 import json
 import re
 import shutil
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -13,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from scenarios.cli.main import main
+from scenarios.cli.twin import subject_of
 from scenarios.show.twin_report import Size
 from tests.logs import RATE_HZ, logged
 from twin.vae.config import TwinConfig
@@ -311,3 +314,18 @@ def test_one_arm_of_a_log_of_several_is_chosen_by_its_name(thermofleet, tmp_path
         ):
             said = thermofleet("twin", *words, "--log", path, *arm)
             assert (said.code, sentence in said.err) == (2, True), said.err
+
+
+@pytest.mark.parametrize(
+    ("scenario", "given", "name"),
+    [(None, None, None), (None, "left", "left"), ("quickstart", None, "arm_0"), ("quickstart", "arm_2", "arm_2")],
+)
+def test_the_twin_of_a_subject_is_opened_once_by_the_name_of_the_arm(monkeypatch, scenario, given, name):
+    opened = []
+    logged = SimpleNamespace(arm=SimpleNamespace(robot="robot"))
+    monkeypatch.setattr("scenarios.prepare.twins.open_twin", lambda folder, arm: opened.append((folder, arm)) or "twin")
+    monkeypatch.setattr("scenarios.motion.recover.logged_arm", lambda twin, *_: logged if twin == "twin" else None)
+    monkeypatch.setattr("twin.thermal.checkpoint.load", lambda _: "network")
+    robot, _, known = subject_of(scenario, given, Path("twins"), Path("network"), "0,0,0", 0.0)
+    assert opened == [(Path("twins"), name)]
+    assert scenario or (robot, known(None)) == ("robot", logged)

@@ -2,6 +2,7 @@
 
 import io
 import shutil
+import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
@@ -12,8 +13,12 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
+from fleet.arm.kinematics import REACH_M
 from scenarios.run.log import RunLog, open_run
+from scenarios.show.layout import LayoutReport, shoulder_m
+from scenarios.show.plan import plan_page
 from scenarios.show.run_page import runs_page
+from scenarios.spec.load import load
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
@@ -169,3 +174,37 @@ def test_words_have_contrast_in_light_and_dark(browser: Browser, run_folder: Pat
             bright, dim = max(ink, paper), min(ink, paper)
             assert (bright + 0.05) / (dim + 0.05) >= 4.5, (scheme, selector, colours)
         page.close()
+
+
+def test_a_moved_and_turned_arm_reaches_what_the_lines_to_paste_say(browser: Browser, tmp_path: Path) -> None:
+    """`shoulder_m` of the changed arms tells the distance that places lack; the arm hangs at a wall."""
+    first, *_ = load("quickstart").arms
+    scenario = replace(load("quickstart"), arms=(replace(first, tilt_deg=(90.0, 10.0, 170.0)),))
+    empty = {"exclusions": (), "at_once": (), "problems": ()}
+    report = LayoutReport(scenario="a", clearance_m=0.0, reach=(), excluded_share=0.0, largest=True, **empty)
+    (tmp_path / "cell.html").write_text(plan_page(scenario, report), encoding="utf-8")
+    page, failed = browser.new_page(), []
+    page.on("pageerror", lambda error: failed.append(str(error)))
+    page.goto((tmp_path / "cell.html").as_uri())
+    page.wait_for_selector("body[data-ready]")
+    assert page.locator("#changes").input_value() == ""
+    for handle, x, y in ((".arm rect", 90, -40), (".arm .tip", -80, 60)):
+        box = page.locator(handle).bounding_box()
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        page.mouse.down()
+        page.mouse.move(box["x"] + x, box["y"] + y, steps=4)
+        page.mouse.up()
+    changed = tomllib.loads(page.locator("#changes").input_value())
+    assert set(changed) == {"position_m", "tilt_deg"}
+    assert changed["tilt_deg"][:2] == [90, 10]
+    assert abs(changed["tilt_deg"][2] - 170) > 20
+    shoulder = shoulder_m(replace(first, **{name: tuple(value) for name, value in changed.items()}).robot())
+    lacks_m = {p.name: np.linalg.norm(np.subtract(p.position_m, shoulder)) - REACH_M for p in scenario.places}
+    expected = {name for name, far in lacks_m.items() if far > 0}
+    assert 0 < len(expected) < len(lacks_m)
+    told = {each.get_attribute("data-place"): each.text_content() for each in page.locator(".place.lacks").all()}
+    assert set(told) == expected
+    for name, text in told.items():
+        assert float(text.split(" lacks ")[1].split()[0]) == pytest.approx(lacks_m[name], abs=0.011)
+    page.close()
+    assert failed == []

@@ -342,6 +342,10 @@ class JobStatus(msgspec.Struct, frozen=True):
     """As in `JobSpec`; null for unknown. A `Change` changes it."""
     release_s: Number | None = None
     """As in `JobSpec`; null for unknown."""
+    accepted_s: Number | None = None
+    """Fleet time at which it was accepted; null for unknown."""
+    shift_ended: bool = False
+    """It is unfinished only because the shift has ended."""
     not_planned: bool = False
     """It waits, and no arm has a plan for it yet: it is unknown whether one can do it. Only
     `jobs/status` has it: it is false in a `Result`."""

@@ -16,7 +16,7 @@ from fleet.arm.space import plan_key, space_name
 from fleet.arm.time_limit import check_time, time_limit
 from fleet.bus.protocol.auction import NOT_PLANNED, JobEstimate, JobSpec, PlanQuote
 from fleet.difficulty import Difficulty, DifficultyModel
-from fleet.errors import InfeasibleJob, printable
+from fleet.errors import InfeasibleJob, listed, printable
 from fleet.heat.motor import gen3_motors
 from fleet.heat.thermal import NODES, WINDING, gen3_network, temperature_steps, thermal_model
 from fleet.job import LONGEST_JOB_S, Job, Place, Work
@@ -278,7 +278,7 @@ class Estimator:
         """Return the task at each alternative place, or why one is not possible."""
         unknown = [name for names in job.every_places for name in names if name not in self._places]
         if unknown:
-            return NoPlan(f"there is no place '{unknown[0]}' in this cell; places: {', '.join(self._places)}")
+            return NoPlan(f"there is no place '{unknown[0]}' in this cell; places: {listed(self._places)}")
         try:
             return tuple(
                 Work(

@@ -261,7 +261,8 @@ class Participant:
             return reason_to_wait(bidding, job.name)
 
         new = [job for job in later if job.name not in book.jobs and job.name not in book.past]
-        coming = JobStatus("?", "unfinished", reason=SHIFT_ENDED) if book.ended else JobStatus("?", "waiting")
+        over = JobStatus("?", "unfinished", reason=SHIFT_ENDED, shift_ended=True)
+        coming = over if book.ended else JobStatus("?", "waiting")
         statuses = self._statuses() + [with_terms(replace(coming, job=job.name), job) for job in new]
         specs = {job.name: job for job in new} | {name: entry.spec for name, entry in book.waiting.items()}
         return [

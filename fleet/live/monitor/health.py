@@ -10,7 +10,6 @@ from typing import Literal
 import msgspec
 
 from fleet.live.clock import FleetClock
-from fleet.live.job_rules import SHIFT_ENDED
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetSnapshot
 
 REASONS = {
@@ -144,12 +143,12 @@ def check_fleet(
 
 
 def check_jobs(fleet: FleetSnapshot) -> list[Finding]:
-    """Check that no job is unfinished or abandoned; the end of the shift is no fault."""
+    """Check that no job is unfinished, except by the end of the shift, or abandoned."""
     words = {"unfinished": "is unfinished, so its outcome is unknown", "given_up": "is abandoned"}
     return [
         Finding("warning", f"'{job.job}' {words[job.state]}: {job.reason or 'no reason'}", job.state, job.job)
         for job in fleet.jobs
-        if job.state in words and job.reason != SHIFT_ENDED
+        if job.state in words and not job.shift_ended
     ]
 
 

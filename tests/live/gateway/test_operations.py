@@ -62,7 +62,7 @@ FLEET = FleetSnapshot(
     (AuctioneerSnapshot("au", True, 1.5),),
     {"waiting": 2, "finished": 7},
     (
-        JobStatus("j", "waiting", release_s=40.0, reason="It waits until b is out of the way."),
+        JobStatus("j", "waiting", release_s=0.0, accepted_s=40.0, reason="It waits until b is out of the way."),
         JobStatus("k", "waiting"),
     ),
     speed=60.0,

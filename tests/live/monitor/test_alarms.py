@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from fleet.bus.protocol.auction import JobStatus
 from fleet.bus.protocol.operator import Alarm
 from fleet.errors import Refused
-from fleet.live.job_rules import SHIFT_ENDED
 from fleet.live.monitor.alarms import HOLD_S, AlarmList
 from fleet.live.monitor.health import Finding, check_jobs
 from fleet.live.monitor.snapshot import MAX_ALARMS, FleetSnapshot, FleetView
@@ -126,6 +125,6 @@ def test_the_end_of_the_shift_raises_no_alarm_and_the_text_of_an_absence_stays_t
     lasting = Finding("fault", "arm_1 publishes its state but shows no token", "absent", "arm_1")
     (begun,) = AlarmList("m").update([lasting], 5.0, 5.0)
     assert begun.what == "arm_1 is absent: it has left, or its process hangs or has ended."
-    jobs = (JobStatus("a", "unfinished", reason=SHIFT_ENDED), JobStatus("b", "unfinished", reason="An arm stopped."))
+    jobs = (JobStatus("a", "unfinished", shift_ended=True), JobStatus("b", "unfinished", reason="An arm stopped."))
     fleet = FleetSnapshot("f", (), (), {}, jobs)
     assert [finding.subject for finding in check_jobs(fleet)] == ["b"]
