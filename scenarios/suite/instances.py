@@ -26,7 +26,7 @@ import msgspec
 import numpy as np
 
 from fleet.arrivals import Arrivals
-from fleet.bus.exchange.channel import Partition
+from fleet.bus.exchange.channel import Channel, Partition
 from fleet.job import DWELL_S, Kind, Place
 from fleet.robot import ThermalLimits, rotation
 from scenarios.spec.parse import parse_scenario
@@ -34,7 +34,6 @@ from scenarios.spec.schema import (
     SPLITS,
     Ambient,
     ArmSpec,
-    BusSpec,
     JobStream,
     Scenario,
     SplitName,
@@ -290,12 +289,12 @@ WAVES_S = 1200.0
 """waves: approximate time between two waves of light jobs."""
 RUSH, RUSH_SHARE = (0.35, 0.55), 0.5
 """rush: this share of the light jobs arrives in this part of the shift, besides those that arrive all the time."""
-BUSES: dict[Bus, BusSpec] = {
-    "perfect": BusSpec(),
-    "late": BusSpec(delay_s=20.0, jitter_s=20.0),
-    "lossy": BusSpec(loss=0.6),
-    "ring": BusSpec(topology="ring", delay_s=10.0),
-    "cut": BusSpec(),
+BUSES: dict[Bus, Channel] = {
+    "perfect": Channel(),
+    "late": Channel(delay_s=20.0, jitter_s=20.0),
+    "lossy": Channel(loss=0.6),
+    "ring": Channel(topology="ring", delay_s=10.0),
+    "cut": Channel(),
 }
 """cut: also, two halves of the fleet exchange no messages in the middle third of the shift."""
 
@@ -431,7 +430,7 @@ def describe(cell: SuiteCell, axes: Axes) -> str:
     return f"{trade} by {cell.arms} arms ({cell.layout}; {asks}): {values}."
 
 
-def _bus(quality: Bus, arms: list[str], horizon_s: float) -> BusSpec:
+def _bus(quality: Bus, arms: list[str], horizon_s: float) -> Channel:
     spec = BUSES[quality]
     if quality != "cut":
         return spec
