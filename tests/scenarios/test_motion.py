@@ -18,7 +18,7 @@ from fleet.job import Place, Work
 from fleet.motion import RATE_HZ, Phase
 from fleet.robot import GEN3, Robot
 from scenarios.motion.generate import GenerationError, Verification, bare_arm, generate, perform
-from scenarios.motion.recover import Recovery, save_generated, save_recovery
+from scenarios.motion.recover import Candidate, Nearby, Recovery, Search, save_generated, save_recovery
 from scenarios.prepare.oracle import peaks
 from twin.vae.generate import vary
 
@@ -126,20 +126,13 @@ def test_nonsense_is_refused(subject, asked):
 
 
 @pytest.fixture
-def found():
-    time_s = np.arange(0.0, 6.0, 2.0)
+def found(subject, asked):
+    time_s, warm_c = np.arange(0.0, 6.0, 2.0), np.append([50.0, 51.0], np.full(5, 50.0))
     warm = np.linspace(50.0, 53.0, 3)[:, None] + np.zeros(7)
+    model = ArmModel(subject.arm.robot)
     return Recovery(
-        arm="arm",
-        twin_version="abc",
-        payload_kg=3.0,
-        q_before=np.zeros(7),
-        q_after=np.full(7, 0.1),
-        origin="latent",
-        hottest=1,
-        difficulty_before=np.full(7, 0.9),
-        difficulty_after=np.full(7, 0.4),
-        tool_m=0.2,
+        search=Search(subject.twin, model, asked, Nearby(), np.zeros(7), 3.0, warm_c, warm_c, hold_s=600.0),
+        found=Candidate(np.full(7, 0.1), "latent", tool_m=0.2, error=1.0),
         passed_over={"collision": 3},
         best_error={"latent": 1.0},
         time_s=time_s,
@@ -194,8 +187,8 @@ def test_only_its_like_is_replaced_and_only_when_asked(found, made, tmp_path):
         save_recovery(found, tmp_path / "out")
     with pytest.raises(FleetError, match="holds other files"):
         save_generated(made, tmp_path / "out", overwrite=True)
-    save_recovery(replace(found, payload_kg=2.0), tmp_path / "out", overwrite=True)
-    assert json.loads((tmp_path / "out" / "recovery.json").read_text(encoding="utf-8"))["payload_kg"] == 2.0
+    save_recovery(replace(found, error_rad=2.0), tmp_path / "out", overwrite=True)
+    assert json.loads((tmp_path / "out" / "recovery.json").read_text(encoding="utf-8"))["tracking_error_rad"] == 2.0
 
 
 ROBOT = Robot(name="arm", tool_kg=0.9)

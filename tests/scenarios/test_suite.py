@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.freeze_suite import faults_of, minutes_of
+from benchmarks.freeze_suite import drawn_rows, faults_of, minutes_of
 from fleet.bus.exchange.channel import Channel
 from fleet.errors import ScenarioError
 from scenarios.evaluate.leaderboard import read_all
@@ -28,7 +28,7 @@ from scenarios.suite.instances import (
     layout,
     scenario_of,
 )
-from scenarios.suite.splits import cell_of_instance, drawn_rows, instance, manifest, split
+from scenarios.suite.splits import cell_of_instance, instance, manifest, split
 
 PLAIN = Axes(heat="warm", arrivals="poisson", due="usual", faults="attended", bus="perfect")
 SMALL = [cell for cell in CELLS if cell.arms <= 8]
