@@ -54,14 +54,6 @@ class Variation:
     """The same in training standard deviations of each joint."""
 
 
-def check_source(source: Plan, s: float) -> None:
-    """Raise ValueError if s is negative or not finite, or the source has no cycle."""
-    if not 0 <= s < np.inf:
-        raise ValueError(f"The perturbation s must be a number >= 0 of posterior standard deviations (got {s}).")
-    if len(source.cycle.profile) == 0:
-        raise ValueError(f"The plan of arm '{source.arm}' has no cycle to vary.")
-
-
 def vary(twin: Twin, source: Plan, s: float, rng: np.random.Generator) -> Variation:
     """A motion `s` posterior standard deviations from a known one: z = mu + s·eps·sigma, decoded, joined, timed.
 
@@ -73,9 +65,12 @@ def vary(twin: Twin, source: Plan, s: float, rng: np.random.Generator) -> Variat
         source: Motion like that on which the twin was trained.
 
     Raises:
-        ValueError: as `check_source`, or the plan has other joints than the twin.
+        ValueError: s is negative or not finite, or the source has no cycle, or other joints than the twin.
     """
-    check_source(source, s)
+    if not 0 <= s < np.inf:
+        raise ValueError(f"The perturbation s must be a number >= 0 of posterior standard deviations (got {s}).")
+    if len(source.cycle.profile) == 0:
+        raise ValueError(f"The plan of arm '{source.arm}' has no cycle to vary.")
     if s > 0 and twin.config.kind == "ae":
         raise ValueError("A plain autoencoder has no posterior to draw from: give s = 0, or a twin of kind vae.")
     phases, errors = [], []
