@@ -19,7 +19,7 @@ from fleet.motion import RATE_HZ, Phase
 from fleet.robot import GEN3, Robot
 from scenarios.motion.generate import GenerationError, Verification, bare_arm, generate, perform
 from scenarios.motion.recover import Candidate, Nearby, Recovery, Search, save_generated, save_recovery
-from scenarios.prepare.oracle import peaks
+from scenarios.prepare.twins import cold_peaks
 from twin.vae.generate import vary
 
 
@@ -240,7 +240,7 @@ def test_motors_heat_as_the_law_says_of_the_planned_torque():
     np.testing.assert_array_equal(done.temp_c[0], COLD_C[:7])
     np.testing.assert_allclose(np.diff(done.time_s), 2.0)
     arrived = round(plan.approach.duration_s / 2.0)
-    held = peaks([plan], [120.0], motors=ARM.motors, thermal=ARM.thermal, start_c=COLD_C, ambient_c=23.0)[0]
+    (held,) = cold_peaks([plan], ARM.motors, ARM.thermal, ambient_c=23.0, horizon_s=120.0)
     np.testing.assert_allclose(done.temp_c[arrived + 60], held, atol=0.4)
     assert held[1] - 23.0 > 10.0
 
