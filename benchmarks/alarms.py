@@ -20,6 +20,7 @@ from typing import get_args
 import numpy as np
 from rich.console import Console
 
+from benchmarks.freeze_suite import surprises_in
 from benchmarks.paper.harness import WIDEST, KeyedRows, Unit, compute, matching, mean_by_group, number, plain, table_of
 from fleet.arm.model import ArmModel
 from fleet.engine.shift import StepRecord, stack_records
@@ -37,7 +38,7 @@ from scenarios.prepare.surprise import phase_with_load
 from scenarios.prepare.twins import train_twins
 from scenarios.progress import quiet
 from scenarios.spec.schema import Scenario, SurpriseKind
-from scenarios.suite.instances import CELLS, Axes, SuiteCell, Surprising, scenario_of, surprises_in
+from scenarios.suite.instances import CELLS, Axes, SuiteCell, Surprising, scenario_of
 from scenarios.table import Table
 from twin.baselines import untrained_config
 from twin.thermal.thermal_twin import CalibratedTwin

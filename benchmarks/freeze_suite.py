@@ -12,30 +12,34 @@ few shifts, then interpolation between the means of four times as many at three 
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 
+from fleet.seeding import shift_seeds
 from scenarios.evaluate.rollout import outcomes
 from scenarios.prepare.fleet import Fleet, prepare
-from scenarios.spec.jobs import alternatives_of
-from scenarios.spec.schema import SPLITS
+from scenarios.spec.jobs import alternatives_of, draw_jobs
+from scenarios.spec.parse import hash_of, scenario_hash
+from scenarios.spec.schema import SPLITS, SplitName, SurpriseKind
 from scenarios.suite.instances import (
     CELLS,
     COOL_C,
     FAULTS,
+    Axes,
     Calibration,
     Level,
     SuiteCell,
+    Surprising,
     calibrations,
-    draw_axes,
+    layout,
     scenario_of,
     tasks_of,
 )
-from scenarios.suite.splits import drawn_rows, line_of
+from scenarios.suite.splits import Instance, ManifestLine, instance_of, line_of
 
 FOLDER = Path(__file__).parents[1] / "scenarios" / "suite"
 DRAWS, SHIFTS = 12, 8
@@ -48,6 +52,65 @@ COOLER_K = 7.0
 """Least by which the level cool is cooler than warm."""
 TOLERANCE = 0.25
 """Share by which the faults of a level may differ on other seeds."""
+SUITE = 37
+"""Seed of all draws of the suite."""
+DIGITS = 3
+"""Decimals of times in a hash of jobs, s: the last bits of a logarithm differ between platforms."""
+SURPRISE_EVERY = 3
+"""In one of three instances something surprises the arms."""
+OFTEN = {"arrivals": "waves", "faults": "attended", "bus": "perfect"}
+"""Values that half of all instances have; all others are equally frequent."""
+
+
+def draw_axes(rng: np.random.Generator, heat: Level, surprises: Sequence[Surprising] = ("nothing",)) -> Axes:
+    """Values sampled independently, but for the level of heat.
+
+    Args:
+        surprises: One of these surprises the arms.
+    """
+    values: dict[str, Any] = {}  # literals of several types
+    for name, kind in get_type_hints(Axes).items():
+        if name == "surprise":
+            break
+        choices = list(get_args(kind))
+        weights = np.array([len(choices) - 1.0 if choice == OFTEN.get(name) else 1.0 for choice in choices])
+        values[name] = choices[int(rng.choice(len(choices), p=weights / weights.sum()))]
+    return Axes(**{**values, "heat": heat}, surprise=surprises[int(rng.integers(len(surprises)))])
+
+
+def surprises_in(cell: SuiteCell) -> tuple[Surprising, ...]:
+    """Kinds of surprises that a cell can have: without a fan none stops."""
+    fans = any(arm.cooling == "forced_air" for arm in layout(cell).arms)
+    return tuple(kind for kind in get_args(SurpriseKind) if fans or kind != "fan")
+
+
+def drawn_rows(name: SplitName) -> Iterator[ManifestLine]:
+    """Sample the lines of a split again, in turns from each of its cells."""
+    cells = [cell for cell in CELLS if cell.split == name]
+    turns = range(max(cell.instances for cell in cells))
+    levels = list(FAULTS)
+    chosen = [(turn, cell) for turn in turns for cell in cells if turn < cell.instances]
+    for number, (turn, cell) in enumerate(chosen):
+        entropy = np.random.SeedSequence([SUITE, SPLITS.index(name), number])
+        seed = int(entropy.generate_state(1)[0])
+        heat = levels[0 if cell.asks == "light_work" else turn % len(levels)]
+        surprised = (turn + cells.index(cell)) % SURPRISE_EVERY == 0
+        surprises = surprises_in(cell) if surprised else ("nothing",)
+        axes = draw_axes(np.random.default_rng(entropy.spawn(1)[0]), heat, surprises)
+        row = ManifestLine(f"{name}/{number:04d}", cell.name, axes, seed, "", "", 0)
+        made = instance_of(row)
+        jobs = jobs_content(made)
+        yield replace(row, scenario=scenario_hash(made.scenario), jobs=hash_of(jobs), count=len(jobs))
+
+
+def jobs_content(made: Instance) -> list[Any]:
+    """The jobs of an instance's shift as JSON values, in order of release."""
+    jobs = draw_jobs(made.scenario, shift_seeds(np.random.SeedSequence(made.seed))[0])
+    return [
+        [job.name, job.work.kind, [work.stations for work in job.works], job.work.payload_kg, job.repetitions,
+         round(job.release_s, DIGITS), round(job.due_s, DIGITS), job.value, job.after, job.expires]
+        for job in jobs
+    ]  # fmt: skip
 
 
 def minutes_of(cell: SuiteCell) -> tuple[dict[str, float], Fleet]:

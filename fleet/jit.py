@@ -132,11 +132,6 @@ def cache_of_this_code() -> Path:
     return user_cache_folder() / "compiled" / digest.hexdigest()[:16]
 
 
-def is_compiled(*kernels: Kernel) -> bool:
-    """Whether the cache has these kernels, for this Python and this copy of the source."""
-    return all(_note_of(each.function).exists() for each in kernels)
-
-
 def _note_of(function: Callable[..., Any]) -> Path:
     """The empty file that is there once a kernel is compiled; numba compiles anew where any of these parts differs."""
     source = Path(function.__code__.co_filename)

@@ -294,7 +294,7 @@ def recover_command(
     say(
         f"Joint {hot + 1} goes from {found.with_c[0, hot]:.1f} °C to {found.with_c[-1, hot]:.1f} °C in "
         f"{hold_s:g} s; without the new posture to {found.without_c[-1, hot]:.1f} °C. The tool moves "
-        f"{found.tool_m:.2f} m. Written to {out}.",
+        f"{found.found.tool_m:.2f} m. Written to {out}.",
         out_console,
     )
 

@@ -129,7 +129,7 @@ def run_fleet(
         for module in (*SHARED, *(SHARED_BY_PAGE if page else ())):  # first, so that the memory of `prepare` is freed
             import_module(module)
         # Once, so that no arm has to plan or train by itself.
-        prepare(chosen, difficulty=spec.difficulty, risk=spec.risk, progress=progress, simulated=False)
+        prepare(chosen, difficulty=spec.difficulty, risk=spec.risk, progress=progress)
     own_router, parts, record, auction = parts_of(
         scenario,
         names,

@@ -170,14 +170,6 @@ Endpoint = Callable[[Request], Awaitable[Response]]
 NO_TOKENS: Mapping[str, Role] = {}
 
 
-class HttpProblem(Exception):
-    """An HTTP error with its explanation."""
-
-    def __init__(self, status: HTTPStatus, detail: str) -> None:
-        super().__init__(detail)
-        self.status, self.detail = status, detail
-
-
 def check_token(token: str) -> str:
     """Return the token.
 
@@ -331,7 +323,7 @@ def application(
 
     async def limited(request: Callable[[], Awaitable[Reply]]) -> Reply:
         if slots.locked():
-            raise HttpProblem(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_REQUESTS} requests are waiting; try again.")
+            raise HTTPException(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_REQUESTS} requests are waiting; try again.")
         async with slots:
             return await request()
 
@@ -385,7 +377,7 @@ def application(
     async def post_reset(request: Request) -> Response:
         body = await read_body(request, ResetBody)
         if not is_name(body.arm):
-            raise HttpProblem(HTTPStatus.UNPROCESSABLE_ENTITY, f"The name of an arm must have {NAME_RULE}.")
+            raise HTTPException(HTTPStatus.UNPROCESSABLE_ENTITY, f"The name of an arm must have {NAME_RULE}.")
         key = keys.of_arm(bridge.fleet, body.arm, "reset")
         return json_response(await ask(key, ResetRequest(body.by), ResetReply))
 
@@ -403,7 +395,7 @@ def application(
         try:
             return json_response(await bridge.acknowledge(body.alarm, body.by))
         except Refused as error:
-            raise HttpProblem(HTTPStatus.CONFLICT, str(error)) from error
+            raise HTTPException(HTTPStatus.CONFLICT, str(error)) from error
 
     async def ask_cell() -> Cell:
         return await ask(keys.of_jobs(bridge.fleet, "cell"), CellRequest(), Cell)
@@ -422,7 +414,7 @@ def application(
     async def events(request: Request) -> Response:
         if readers.closed or len(readers.connected) >= MAX_READERS:
             detail = f"{len(readers.connected)} readers are connected; try again later."
-            raise HttpProblem(HTTPStatus.SERVICE_UNAVAILABLE, detail)
+            raise HTTPException(HTTPStatus.SERVICE_UNAVAILABLE, detail)
         return EventStream(bridge.feed, readers, boot, request.headers.get("last-event-id", ""))
 
     async def contents(request: Request) -> Response:
@@ -450,7 +442,7 @@ def application(
     routes = [Route(path, _checked(role, handle), methods=[method]) for method, path, role, handle, _ in table]
     if page is not None:
         routes += [Route(f"/page/{name}", page.file, methods=["GET"]) for name in (*FILES, "three.js")]
-    handlers = dict.fromkeys((HttpProblem, BusError, Refused, ScenarioError, HTTPException, Exception), error_response)
+    handlers = dict.fromkeys((BusError, Refused, ScenarioError, HTTPException, Exception), error_response)
     access = Middleware(AccessCheck, tokens=tokens, page=page is not None)
     return Starlette(routes=routes, exception_handlers=handlers, middleware=[access])
 
@@ -510,7 +502,7 @@ def _checked(needed: Role, handle: Endpoint) -> Endpoint:
     async def check(request: Request) -> Response:
         role: Role = request.scope["role"]
         if ROLES.index(role) < ROLES.index(needed):
-            raise HttpProblem(HTTPStatus.FORBIDDEN, f"This token has the role {role}; this request needs {needed}.")
+            raise HTTPException(HTTPStatus.FORBIDDEN, f"This token has the role {role}; this request needs {needed}.")
         return await handle(request)
 
     return check
@@ -520,12 +512,12 @@ async def read_body(request: Request, kind: type[Body]) -> Body:
     """Read the message that is the body of a request.
 
     Raises:
-        HttpProblem: not JSON, too large or too slow.
+        HTTPException: not JSON, too large or too slow.
         MalformedMessage: not a message of this kind.
     """
     if (given := content_type(request)) != "application/json":
         detail = f"The body must be application/json, or for /v4/jobs also {TABLE} (got '{given}')."
-        raise HttpProblem(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, detail)
+        raise HTTPException(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, detail)
     return decode(kind, await read_bytes(request, MAX_BYTES))
 
 
@@ -535,7 +527,7 @@ def content_type(request: Request) -> str:
 
 
 async def read_bytes(request: Request, most: int) -> bytes:
-    """Read a body of at most so many bytes; raises an HttpProblem if it is too large or too slow."""
+    """Read a body of at most so many bytes; raises an HTTPException if it is too large or too slow."""
     content = bytearray()
     try:
         async with asyncio.timeout(BODY_S):
@@ -543,11 +535,11 @@ async def read_bytes(request: Request, most: int) -> bytes:
                 content += part
                 if len(content) > most:
                     detail = f"A body has at most {most} bytes; send several requests."
-                    raise HttpProblem(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)
+                    raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)
     except TimeoutError as error:
-        raise HttpProblem(HTTPStatus.REQUEST_TIMEOUT, f"The body did not arrive within {BODY_S:g} s.") from error
+        raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, f"The body did not arrive within {BODY_S:g} s.") from error
     except ClientDisconnect as error:
-        raise HttpProblem(HTTPStatus.BAD_REQUEST, "The body is incomplete.") from error
+        raise HTTPException(HTTPStatus.BAD_REQUEST, "The body is incomplete.") from error
     return bytes(content)
 
 
@@ -559,8 +551,6 @@ def json_response(value: object) -> Response:
 def error_response(_: Request, error: Exception) -> Response:
     """Problem details of an error."""
     match error:
-        case HttpProblem():
-            return problem_response(error.status, error.detail)
         case ScenarioError() | MalformedMessage():
             return problem_response(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
         case BusError() | Refused():

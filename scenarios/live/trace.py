@@ -49,10 +49,11 @@ class Thread:
     """Hash of the code, and versions of the libraries."""
 
     def as_json(self) -> dict[str, Any]:
-        """The thread as JSON values."""
-        award = None if self.award is None else _plain(self.award)
-        events = {"event": _plain(self.event), "award": award, "history": [_plain(each) for each in self.history]}
-        return asdict(self) | events
+        """The thread as values for JSON, events without the env."""
+        values = asdict(self)
+        for event in filter(None, (values["event"], values["award"], *values["history"])):
+            del event["env"]
+        return values
 
 
 def thread_of(folder: Path, asked: str) -> Thread:
@@ -143,13 +144,6 @@ def rows_of(events: Sequence[Event], asked: str) -> list[int]:
         kinds = ", ".join(dict.fromkeys(event.kind for event in events))
         raise FleetError(f"No event of kind '{kind}' was recorded. Recorded: {kinds}.")
     raise FleetError(f"No event '{kind}' of '{name}'{nearest(name, of_kind)}")
-
-
-def _plain(event: Event) -> dict[str, Any]:
-    """An event as JSON values, without the env."""
-    fields = asdict(event)
-    del fields["env"]
-    return fields | {"value": event.value if event.value == event.value else None}
 
 
 def thread_table(thread: Thread) -> Table:

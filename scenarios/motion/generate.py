@@ -27,7 +27,7 @@ from fleet.job import Fixture, Job
 from fleet.motion import RATE_HZ, Phase, Plan
 from fleet.robot import GEN3, Robot, ThermalLimits
 from scenarios.prepare.twins import cold_peaks
-from twin.vae.generate import Variation, check_source, vary
+from twin.vae.generate import Variation, vary
 from twin.vae.twin import Twin
 
 Array = np.ndarray
@@ -159,8 +159,8 @@ class Verification:
         return cls(motors=gen3_motors(wear=robot.wear), thermal=thermal_model(network), ambient_c=ambient_c, **changes)
 
     def peak_c(self, plan: Plan) -> Array:
-        """Predicted hottest winding temperatures, °C, [joint]."""
-        return peak_of(plan, self.motors, self.thermal, self.ambient_c, self.horizon_s)
+        """Hottest winding temperatures when a plan's cycle repeats over the horizon from a cold start, °C, [joint]."""
+        return cold_peaks([plan], self.motors, self.thermal, ambient_c=self.ambient_c, horizon_s=self.horizon_s)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,8 +246,6 @@ def generate(
     usable = [plan for plan in sources if plan.work.kind != "press"]
     if not usable:
         raise ValueError(f"Generation needs a source motion, not a press, for arm '{arm.robot.name}' (got none).")
-    for plan in usable:
-        check_source(plan, s)
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     model, rejected = ArmModel(arm.robot, fixtures), Counter[str]()
     clearance, motions, order = CollisionChecker(model), list[GeneratedMotion](), list[int]()
@@ -296,7 +294,7 @@ def _verified(
         distance_rad=made.distance_rad,
         distance_z=made.distance_z,
         predicted_c=predicted_c,
-        peak_c=peak_of(measured, arm.motors, arm.thermal, asked.ambient_c, asked.horizon_s),
+        peak_c=replace(asked, motors=arm.motors, thermal=arm.thermal).peak_c(measured),
         error_rad=done.error_rad,
     )
 
@@ -312,8 +310,3 @@ def planned(made: Variation, source: Plan, model: ArmModel) -> Plan:
         phases.append(Phase(profile, part.payload_kg.astype(np.float32)))
     approach, cycle, retreat = phases
     return replace(source, approach=approach, cycle=cycle, retreat=retreat)
-
-
-def peak_of(plan: Plan, motors: Motors, thermal: ThermalModel, ambient_c: float, horizon_s: float) -> Array:
-    """Hottest winding temperatures when a plan's cycle repeats over the horizon from a cold start, °C, [joint]."""
-    return cold_peaks([plan], motors, thermal, ambient_c=ambient_c, horizon_s=horizon_s)[0]

@@ -95,13 +95,6 @@ class Nearby:
     speed: float = 0.5
     """Share of the joint limits at which the arm moves."""
 
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0 < value < np.inf:
-                raise ValueError(f"Nearby.{name} must be > 0 (got {value}).")
-        if self.speed > 1:
-            raise ValueError(f"Nearby.speed must be a share of the limits in (0, 1] (got {self.speed}).")
-
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
@@ -313,22 +306,10 @@ LEAST_REST_S = BOUNDS["dwell_s"].low
 class Recovery:
     """A hold with and without recovery, both performed from the same temperatures."""
 
-    arm: str
-    twin_version: str
-    payload_kg: float
-    q_before: Array
-    """rad, [joint]."""
-    q_after: Array
-    """rad, [joint]."""
-    origin: str
-    """Origin of the posture: latent or joint space."""
-    hottest: int
-    """Hottest motor at the start, index 0..6."""
-    difficulty_before: Array
-    """One-sided torque difficulty of the hold, [joint], each in [0, 1)."""
-    difficulty_after: Array
-    tool_m: float
-    """Displacement of the tool."""
+    search: Search
+    """The arm, its twin and the hold."""
+    found: Candidate
+    """The new posture."""
     passed_over: dict[str, int]
     """Easier candidates that were rejected, by reason."""
     best_error: dict[str, float]
@@ -343,9 +324,9 @@ class Recovery:
     """Largest deviation of a joint from its plan during the recovery."""
 
     @property
-    def moved_rad(self) -> Array:
-        """Displacement of each joint, [joint]."""
-        return self.q_after - self.q_before
+    def hottest(self) -> int:
+        """Hottest motor at the start, index 0..6."""
+        return self.search.hottest
 
     @property
     def cooled_k(self) -> float:
@@ -402,16 +383,8 @@ def recover(
     found, plan, passed_over, best_error = search.best(np.random.default_rng(np.random.SeedSequence(seed)))
     recovered = on(plan)
     return Recovery(
-        arm=arm.robot.name,
-        twin_version=twin.version,
-        payload_kg=payload_kg,
-        q_before=search.q,
-        q_after=found.q,
-        origin=found.origin,
-        hottest=search.hottest,
-        difficulty_before=holding(twin, model, search.q[None], payload_kg).load[0],
-        difficulty_after=holding(twin, model, found.q[None], payload_kg).load[0],
-        tool_m=found.tool_m,
+        search=search,
+        found=found,
         passed_over=passed_over,
         best_error=best_error,
         time_s=time_s,
@@ -670,24 +643,28 @@ def generated_summary(made: Generated) -> dict[str, Any]:
 
 def recovery_summary(recovery: Recovery) -> dict[str, Any]:
     """The recovery as plain values; joints are counted from one."""
+    search, found, hottest = recovery.search, recovery.found, recovery.hottest
+    before, after = (
+        holding(search.twin, search.model, q[None], search.payload_kg).load[0] for q in (search.q, found.q)
+    )
     return {
         "status": "finished",
-        "arm": recovery.arm,
-        "twin": recovery.twin_version,
-        "payload_kg": recovery.payload_kg,
-        "hottest_joint": recovery.hottest + 1,
-        "q_before_rad": recovery.q_before.tolist(),
-        "q_after_rad": recovery.q_after.tolist(),
-        "origin": recovery.origin,
-        "most_moved_rad": float(np.abs(recovery.moved_rad).max()),
-        "tool_moved_m": recovery.tool_m,
-        "difficulty_before": recovery.difficulty_before.tolist(),
-        "difficulty_after": recovery.difficulty_after.tolist(),
+        "arm": search.model.robot.name,
+        "twin": search.twin.version,
+        "payload_kg": search.payload_kg,
+        "hottest_joint": hottest + 1,
+        "q_before_rad": search.q.tolist(),
+        "q_after_rad": found.q.tolist(),
+        "origin": found.origin,
+        "most_moved_rad": float(np.abs(found.q - search.q).max()),
+        "tool_moved_m": found.tool_m,
+        "difficulty_before": before.tolist(),
+        "difficulty_after": after.tolist(),
         "best_error": recovery.best_error,
         "passed_over": recovery.passed_over,
-        "start_c": float(recovery.with_c[0, recovery.hottest]),
-        "end_with_c": float(recovery.with_c[-1, recovery.hottest]),
-        "end_without_c": float(recovery.without_c[-1, recovery.hottest]),
+        "start_c": float(recovery.with_c[0, hottest]),
+        "end_with_c": float(recovery.with_c[-1, hottest]),
+        "end_without_c": float(recovery.without_c[-1, hottest]),
         "cooled_k": recovery.cooled_k,
         "spared_k": recovery.spared_k,
         "tracking_error_rad": recovery.error_rad,

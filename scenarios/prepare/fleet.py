@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,7 +21,6 @@ from fleet.engine.world import Arm, World, build_world, warm_start
 from fleet.env.lookahead import CellSimulator
 from fleet.errors import FleetError, InfeasibleJob, ScenarioError
 from fleet.files import cache_folder
-from fleet.jit import is_compiled
 from fleet.job import Job, Work
 from fleet.motion import Plan
 from fleet.robot import Robot
@@ -83,7 +81,6 @@ def prepare(
     cache: str | Path | None = None,
     progress: Progress = quiet,
     like: Fleet | None = None,
-    simulated: bool = True,
 ) -> Fleet:
     """Plan every task type for every arm, and assign each arm its difficulty model; both are cached by content.
 
@@ -92,7 +89,6 @@ def prepare(
         randomise: In addition to what a scenario samples for a shift: ambient temperature, arrivals, fleets.
         training: Which training of the twins, from 0.
         like: Prepared from a scenario with the same arms, cell and task types; its plans and space table are reused.
-        simulated: Whether shifts will be simulated: then the engine is compiled meanwhile.
 
     Raises:
         ScenarioError: no such scenario, no arm can do some work, an arm can do none, arms at home are too close to each
@@ -105,36 +101,16 @@ def prepare(
     fleets: list[Fleet] = []
     for i, spec in enumerate(specs):
         share = progress if len(specs) == 1 else lambda stage, s, i=i: progress(stage, (i + s) / len(specs))
-        every = range(len(spec.arms))
         made = like and like.all[i]
         arms, planned = _arms(
-            spec,
-            every,
-            difficulty,
-            risk,
-            cache,
-            share,
-            every_work=True,
-            simulated=simulated,
-            training=training,
-            like=made,
+            spec, range(len(spec.arms)), difficulty, risk, cache, share, every_work=True, training=training, like=made
         )
-        fleets.append(_fleet(spec, arms, planned, _folder(cache), made, share))
+        plans = [plan for arm in arms for variants in arm.plans.values() for plan in variants]
+        robots = [arm.robot for arm in arms]
+        space = made.space if made else space_of(spec, robots, plans, _folder(cache), share)
+        refused = tuple(error for arm in planned for error in arm.infeasible)
+        fleets.append(Fleet(spec, tuple(arms), refused, space, planned=tuple(planned)))
     return replace(fleets[0], randomise=randomise, variants=tuple(fleets[1:]))
-
-
-def _fleet(
-    scenario: Scenario,
-    arms: Sequence[Arm],
-    planned: Sequence[PlannedArm],
-    folder: Path,
-    like: Fleet | None = None,
-    progress: Progress = quiet,
-) -> Fleet:
-    plans = [plan for arm in arms for variants in arm.plans.values() for plan in variants]
-    space = like.space if like else space_of(scenario, [arm.robot for arm in arms], plans, folder, progress)
-    refused = [error for arm in planned for error in arm.infeasible]
-    return Fleet(scenario, tuple(arms), tuple(refused), space, planned=tuple(planned))
 
 
 def space_of(
@@ -175,7 +151,6 @@ def _arms(
     progress: Progress,
     *,
     every_work: bool,
-    simulated: bool = False,
     training: int = 0,
     like: Fleet | None = None,
 ) -> tuple[list[Arm], Sequence[PlannedArm]]:
@@ -183,7 +158,6 @@ def _arms(
 
     Args:
         every_work: Raise if none of the arms can do some work.
-        simulated: Compile the engine meanwhile.
     """
     check_progress(progress)
     if choose("difficulty", difficulty, DifficultyName) == "twin" and not is_shipped(scenario.name):
@@ -201,8 +175,6 @@ def _arms(
         from scenarios.prepare.twins import train_twins, training_seed
         from twin.thermal.thermal_twin import CalibratedTwin
 
-        if simulated:
-            _compile_meanwhile(scenario, arms, folder)
         twins = train_twins(scenario, planned, folder, progress, seed=training_seed(scenario, training))
         heats = calibrate_networks(scenario, planned, folder, progress, risk=risk)
         arms = [
@@ -241,22 +213,6 @@ def _blind_arm(planned: PlannedArm, works: Sequence[Work], folder: Path) -> Arm:
         plans={work: planned.plans[work] for work in works if work in planned.plans},
         too_heavy=planned.too_heavy,
     )
-
-
-def _compile_meanwhile(scenario: Scenario, arms: Sequence[Arm], folder: Path) -> None:
-    """Compile the engine, unless it was compiled, in a thread, while other processes train."""
-    from fleet.engine.batch import reset_rows
-    from fleet.engine.step import step_rows
-
-    if is_compiled(step_rows, reset_rows):
-        return
-    env = env_of(_fleet(scenario, arms, (), folder), bus="memory")
-
-    def compile_it() -> None:
-        env.reset(seed=0)
-        env.step(dict.fromkeys(env.agents, 0))
-
-    Thread(target=compile_it, name="compile the engine").start()
 
 
 def _folder(cache: str | Path | None) -> Path:

@@ -119,20 +119,6 @@ def schedule(events: Sequence[Event], arms: Sequence[str], horizon_s: float) -> 
     return Schedule(tuple(assignments), tuple(outages), horizon_s, tuple(breaks))
 
 
-def payloads(telemetry: Telemetry, plan: Schedule, arms: Sequence[str], payload_of: Mapping[str, float]) -> Array:
-    """Payloads in the hands, kg, [sample, arm].
-
-    Args:
-        plan: Which arm worked on what.
-        payload_of: Payload of each job, kg; none for others.
-    """
-    load_kg = np.zeros(telemetry.mode.shape, np.float32)
-    for work in plan.assignments:
-        rows = slice(*np.searchsorted(telemetry.time_s, (work.start_s, work.finished_s or work.end_s)))
-        load_kg[rows, arms.index(work.arm)] = payload_of.get(work.job, 0.0)
-    return load_kg
-
-
 def _assignments(arm: str, log: Sequence[Event], horizon_s: float) -> list[JobSpan]:
     """Assignments of one arm, from its events in order."""
     out: list[JobSpan] = []
@@ -343,7 +329,12 @@ class ShiftLog:
     @cached_property
     def load_kg(self) -> Array:
         """Payload in each hand, kg, [sample, arm]."""
-        return payloads(self.readings, self.plan, self.arms, {job.job: job.payload_kg for job in self.jobs})
+        payload_of = {job.job: job.payload_kg for job in self.jobs}
+        load_kg, time_s = np.zeros(self.readings.mode.shape, np.float32), self.readings.time_s
+        for work in self.plan.assignments:
+            rows = slice(*np.searchsorted(time_s, (work.start_s, work.finished_s or work.end_s)))
+            load_kg[rows, self.arms.index(work.arm)] = payload_of.get(work.job, 0.0)
+        return load_kg
 
 
 def job_records(world: World, state: State) -> tuple[JobRecord, ...]:

@@ -346,7 +346,7 @@ def _check(scenario: Scenario, path: Path) -> None:
         raise ScenarioError("\n".join(f"{file}: {fault}" for fault in faults))
     check_breaks(scenario, file)
     try:
-        scenario.bus.channel().check([arm.name for arm in scenario.arms])
+        scenario.bus.check([arm.name for arm in scenario.arms])
     except ValueError as error:
         raise ScenarioError(f"{file}: bus.partitions: {error}") from error
     names = {"arm": {arm.name: arm for arm in scenario.arms}, "jobs": dict.fromkeys(streams)}

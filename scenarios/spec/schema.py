@@ -7,7 +7,7 @@ import numpy as np
 
 from fleet.arrivals import Arrivals
 from fleet.breaks import Break
-from fleet.bus.exchange.channel import Channel, Partition, TopologyName
+from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.engine.batch import RewardWeights
 from fleet.env.validation import Decisions
 from fleet.errors import MAX_NAME, FleetError, check_between, check_names, check_nonnegative, check_positive, nearest
@@ -180,29 +180,6 @@ class People:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BusSpec:
-    """How the arms' messages reach their peers in a simulated shift; fields as in `fleet.bus.exchange.channel.Channel`.
-
-    A channel that a command or a call is given, other than a perfect one, takes its place.
-    """
-
-    topology: TopologyName = "complete"
-    radius: float = Channel.radius
-    topology_seed: int = Channel.topology_seed
-    delay_s: float = Channel.delay_s
-    jitter_s: float = Channel.jitter_s
-    loss: float = Channel.loss
-    partitions: tuple[Partition, ...] = ()
-
-    def __post_init__(self) -> None:
-        self.channel()
-
-    def channel(self) -> Channel:
-        """The channel between the arms."""
-        return Channel(**vars(self))
-
-
-@dataclass(frozen=True, kw_only=True)
 class Planning:
     """Which plans each arm makes for a work."""
 
@@ -337,7 +314,9 @@ class Scenario:
     planning: Planning = field(default_factory=Planning)
     twin: TwinSpec = field(default_factory=TwinSpec)
     spread: Spread = field(default_factory=Spread)
-    bus: BusSpec = field(default_factory=BusSpec)
+    bus: Channel = PERFECT
+    """How the arms' messages reach their peers in a simulated shift. A channel that a command or a call is given, other
+    than a perfect one, takes its place."""
     surprises: tuple[Surprise, ...] = ()
     breaks: tuple[Break, ...] = ()
     shift_begin: str | None = None
@@ -387,7 +366,7 @@ class Scenario:
 
     def channel(self, given: Channel) -> Channel:
         """The given channel between the arms; that of the scenario if the given one is perfect."""
-        return self.bus.channel() if given.perfect else given
+        return self.bus if given.perfect else given
 
     @property
     def ticks(self) -> int:

@@ -12,7 +12,6 @@ cell differ in heat, jobs, faults and bus. The ambient temperature of each level
 `FAULTS`.
 """
 
-import json
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -20,13 +19,13 @@ from functools import cache, lru_cache
 from importlib import resources
 from math import ceil, cos, degrees, pi, sin
 from pathlib import Path
-from typing import Any, Literal, get_args, get_type_hints
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
 from fleet.arrivals import Arrivals
-from fleet.bus.exchange.channel import Partition
+from fleet.bus.exchange.channel import Channel, Partition
 from fleet.job import DWELL_S, Kind, Place
 from fleet.robot import ThermalLimits, rotation
 from scenarios.spec.parse import parse_scenario
@@ -34,7 +33,6 @@ from scenarios.spec.schema import (
     SPLITS,
     Ambient,
     ArmSpec,
-    BusSpec,
     JobStream,
     Scenario,
     SplitName,
@@ -290,12 +288,12 @@ WAVES_S = 1200.0
 """waves: approximate time between two waves of light jobs."""
 RUSH, RUSH_SHARE = (0.35, 0.55), 0.5
 """rush: this share of the light jobs arrives in this part of the shift, besides those that arrive all the time."""
-BUSES: dict[Bus, BusSpec] = {
-    "perfect": BusSpec(),
-    "late": BusSpec(delay_s=20.0, jitter_s=20.0),
-    "lossy": BusSpec(loss=0.6),
-    "ring": BusSpec(topology="ring", delay_s=10.0),
-    "cut": BusSpec(),
+BUSES: dict[Bus, Channel] = {
+    "perfect": Channel(),
+    "late": Channel(delay_s=20.0, jitter_s=20.0),
+    "lossy": Channel(loss=0.6),
+    "ring": Channel(topology="ring", delay_s=10.0),
+    "cut": Channel(),
 }
 """cut: also, two halves of the fleet exchange no messages in the middle third of the shift."""
 
@@ -313,37 +311,11 @@ class Axes:
     """What the arms believe is wrong: see `scenarios.spec.schema.Surprise`."""
 
 
-SURPRISE_EVERY = 3
-"""In one of three instances something surprises the arms."""
 PAYLOAD_FACTORS, FRICTION_SHARES, DRIFTS_K_PER_H = (1.15, 1.3), (1.5, 3.0), (6.0, 12.0)
 """Ranges of the sizes of surprises; a sensor drifts upwards or, three times as often, downwards."""
 READS_LESS = 0.75
 SURPRISED_ARMS = 1 / 3
 """Share of the arms whose friction has grown, or whose sensors drift, at least one."""
-OFTEN = {"arrivals": "waves", "faults": "attended", "bus": "perfect"}
-"""Values that half of all instances have; all others are equally frequent."""
-
-
-def draw_axes(rng: np.random.Generator, heat: Level, surprises: Sequence[Surprising] = ("nothing",)) -> Axes:
-    """Values sampled independently, but for the level of heat.
-
-    Args:
-        surprises: One of these surprises the arms.
-    """
-    values: dict[str, Any] = {}  # literals of several types
-    for name, kind in get_type_hints(Axes).items():
-        if name == "surprise":
-            break
-        choices = list(get_args(kind))
-        weights = np.array([len(choices) - 1.0 if choice == OFTEN.get(name) else 1.0 for choice in choices])
-        values[name] = choices[int(rng.choice(len(choices), p=weights / weights.sum()))]
-    return Axes(**{**values, "heat": heat}, surprise=surprises[int(rng.integers(len(surprises)))])
-
-
-def surprises_in(cell: SuiteCell) -> tuple[Surprising, ...]:
-    """Kinds of surprises that a cell can have: without a fan none stops."""
-    fans = any(arm.cooling == "forced_air" for arm in layout(cell).arms)
-    return tuple(kind for kind in get_args(SurpriseKind) if fans or kind != "fan")
 
 
 def _surprises(cell: SuiteCell, kind: Surprising, streams: Sequence[JobStream], seed: int) -> tuple[Surprise, ...]:
@@ -383,8 +355,8 @@ class Calibration:
 @cache
 def calibrations() -> dict[str, Calibration]:
     """By cell, as `benchmarks/freeze_suite.py` computed them."""
-    text = resources.files("scenarios").joinpath("suite/calibration.json").read_text(encoding="utf-8")
-    return msgspec.convert(json.loads(text), dict[str, Calibration])
+    content = resources.files("scenarios").joinpath("suite/calibration.json").read_bytes()
+    return msgspec.json.decode(content, type=dict[str, Calibration])
 
 
 def scenario_of(name: str, cell: SuiteCell, axes: Axes, seed: int, known: Calibration | None = None) -> Scenario:
@@ -431,7 +403,7 @@ def describe(cell: SuiteCell, axes: Axes) -> str:
     return f"{trade} by {cell.arms} arms ({cell.layout}; {asks}): {values}."
 
 
-def _bus(quality: Bus, arms: list[str], horizon_s: float) -> BusSpec:
+def _bus(quality: Bus, arms: list[str], horizon_s: float) -> Channel:
     spec = BUSES[quality]
     if quality != "cut":
         return spec

@@ -1,34 +1,16 @@
 """The frozen splits: instances with a manifest of hashes, which `benchmarks/freeze_suite.py` writes."""
 
 import json
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from importlib import resources
-from typing import Any
 
-import numpy as np
+import msgspec
 
 from fleet.errors import ScenarioError
-from fleet.seeding import shift_seeds
-from scenarios.spec.jobs import draw_jobs
-from scenarios.spec.parse import choose, hash_of, scenario_hash
+from scenarios.spec.parse import choose
 from scenarios.spec.schema import SPLITS, Scenario, SplitName
-from scenarios.suite.instances import (
-    CELLS,
-    FAULTS,
-    SURPRISE_EVERY,
-    Axes,
-    SuiteCell,
-    draw_axes,
-    scenario_of,
-    surprises_in,
-)
-
-SUITE = 37
-"""Seed of all draws of the suite."""
-DIGITS = 3
-"""Decimals of times in a hash of jobs, s: the last bits of a logarithm differ between platforms."""
+from scenarios.suite.instances import CELLS, Axes, SuiteCell, scenario_of
 
 
 @dataclass(frozen=True)
@@ -53,7 +35,7 @@ class ManifestLine:
     scenario: str
     """Hash of the scenario, see `scenarios.spec.parse`."""
     jobs: str
-    """Hash of the drawn jobs, see `jobs_content`."""
+    """Hash of the jobs of the shift, see `benchmarks.freeze_suite.jobs_content`."""
     count: int
     """Jobs of the shift."""
 
@@ -91,8 +73,7 @@ def manifest(name: str) -> tuple[ManifestLine, ...]:
         ScenarioError: there is no such split.
     """
     file = resources.files("scenarios").joinpath(f"suite/{choose('split', name, SplitName)}.jsonl")
-    lines = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
-    return tuple(ManifestLine(**{**line, "axes": Axes(**line["axes"])}) for line in lines)
+    return tuple(msgspec.json.decode(line, type=ManifestLine) for line in file.read_bytes().splitlines())
 
 
 def cell_of_instance(row: ManifestLine) -> SuiteCell:
@@ -118,38 +99,9 @@ def heat_binds(instance: str) -> bool | None:
     return None if row is None else row.axes.heat != "cool"
 
 
-def drawn_rows(name: SplitName) -> Iterator[ManifestLine]:
-    """Sample the lines of a split again, in turns from each of its cells."""
-    cells = [cell for cell in CELLS if cell.split == name]
-    turns = range(max(cell.instances for cell in cells))
-    levels = list(FAULTS)
-    chosen = [(turn, cell) for turn in turns for cell in cells if turn < cell.instances]
-    for number, (turn, cell) in enumerate(chosen):
-        entropy = np.random.SeedSequence([SUITE, SPLITS.index(name), number])
-        seed = int(entropy.generate_state(1)[0])
-        heat = levels[0 if cell.asks == "light_work" else turn % len(levels)]
-        surprised = (turn + cells.index(cell)) % SURPRISE_EVERY == 0
-        surprises = surprises_in(cell) if surprised else ("nothing",)
-        axes = draw_axes(np.random.default_rng(entropy.spawn(1)[0]), heat, surprises)
-        row = ManifestLine(f"{name}/{number:04d}", cell.name, axes, seed, "", "", 0)
-        made = instance_of(row)
-        jobs = jobs_content(made)
-        yield replace(row, scenario=scenario_hash(made.scenario), jobs=hash_of(jobs), count=len(jobs))
-
-
 def line_of(row: ManifestLine) -> str:
     """The line of a manifest file."""
     return json.dumps(asdict(row))
-
-
-def jobs_content(made: Instance) -> list[Any]:
-    """The jobs of an instance's shift as JSON values, in order of release."""
-    jobs = draw_jobs(made.scenario, shift_seeds(np.random.SeedSequence(made.seed))[0])
-    return [
-        [job.name, job.work.kind, [work.stations for work in job.works], job.work.payload_kg, job.repetitions,
-         round(job.release_s, DIGITS), round(job.due_s, DIGITS), job.value, job.after, job.expires]
-        for job in jobs
-    ]  # fmt: skip
 
 
 def instance_of(row: ManifestLine) -> Instance:

@@ -18,8 +18,8 @@ from fleet.job import Place, Work
 from fleet.motion import RATE_HZ, Phase
 from fleet.robot import GEN3, Robot
 from scenarios.motion.generate import GenerationError, Verification, bare_arm, generate, perform
-from scenarios.motion.recover import Recovery, save_generated, save_recovery
-from scenarios.prepare.oracle import peaks
+from scenarios.motion.recover import Candidate, Nearby, Recovery, Search, save_generated, save_recovery
+from scenarios.prepare.twins import cold_peaks
 from twin.vae.generate import vary
 
 
@@ -126,20 +126,13 @@ def test_nonsense_is_refused(subject, asked):
 
 
 @pytest.fixture
-def found():
-    time_s = np.arange(0.0, 6.0, 2.0)
+def found(subject, asked):
+    time_s, warm_c = np.arange(0.0, 6.0, 2.0), np.append([50.0, 51.0], np.full(5, 50.0))
     warm = np.linspace(50.0, 53.0, 3)[:, None] + np.zeros(7)
+    model = ArmModel(subject.arm.robot)
     return Recovery(
-        arm="arm",
-        twin_version="abc",
-        payload_kg=3.0,
-        q_before=np.zeros(7),
-        q_after=np.full(7, 0.1),
-        origin="latent",
-        hottest=1,
-        difficulty_before=np.full(7, 0.9),
-        difficulty_after=np.full(7, 0.4),
-        tool_m=0.2,
+        search=Search(subject.twin, model, asked, Nearby(), np.zeros(7), 3.0, warm_c, warm_c, hold_s=600.0),
+        found=Candidate(np.full(7, 0.1), "latent", tool_m=0.2, error=1.0),
         passed_over={"collision": 3},
         best_error={"latent": 1.0},
         time_s=time_s,
@@ -194,8 +187,8 @@ def test_only_its_like_is_replaced_and_only_when_asked(found, made, tmp_path):
         save_recovery(found, tmp_path / "out")
     with pytest.raises(FleetError, match="holds other files"):
         save_generated(made, tmp_path / "out", overwrite=True)
-    save_recovery(replace(found, payload_kg=2.0), tmp_path / "out", overwrite=True)
-    assert json.loads((tmp_path / "out" / "recovery.json").read_text(encoding="utf-8"))["payload_kg"] == 2.0
+    save_recovery(replace(found, error_rad=2.0), tmp_path / "out", overwrite=True)
+    assert json.loads((tmp_path / "out" / "recovery.json").read_text(encoding="utf-8"))["tracking_error_rad"] == 2.0
 
 
 ROBOT = Robot(name="arm", tool_kg=0.9)
@@ -247,7 +240,7 @@ def test_motors_heat_as_the_law_says_of_the_planned_torque():
     np.testing.assert_array_equal(done.temp_c[0], COLD_C[:7])
     np.testing.assert_allclose(np.diff(done.time_s), 2.0)
     arrived = round(plan.approach.duration_s / 2.0)
-    held = peaks([plan], [120.0], motors=ARM.motors, thermal=ARM.thermal, start_c=COLD_C, ambient_c=23.0)[0]
+    (held,) = cold_peaks([plan], ARM.motors, ARM.thermal, ambient_c=23.0, horizon_s=120.0)
     np.testing.assert_allclose(done.temp_c[arrived + 60], held, atol=0.4)
     assert held[1] - 23.0 > 10.0
 

@@ -27,7 +27,6 @@ def prepare_shipped(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Fleet:
     with monkeypatch.context() as without:
         without.setattr("fleet.arm.plan_cache._write", fail)
         without.setattr("scenarios.prepare.twins.require_extra", fail)
-        without.setattr("scenarios.prepare.fleet._compile_meanwhile", lambda *_: None)
         return prepare("quickstart", cache=cache)
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.freeze_suite import faults_of, minutes_of
+from benchmarks.freeze_suite import drawn_rows, faults_of, minutes_of
+from fleet.bus.exchange.channel import Channel
 from fleet.errors import ScenarioError
 from scenarios.evaluate.leaderboard import read_all
 from scenarios.evaluate.runner import run_study
@@ -15,7 +16,7 @@ from scenarios.prepare.fleet import prepare
 from scenarios.spec.jobs import all_works, alternatives_of
 from scenarios.spec.load import load
 from scenarios.spec.parse import scenario_content
-from scenarios.spec.schema import SPLITS, BusSpec, Scenario
+from scenarios.spec.schema import SPLITS, Scenario
 from scenarios.suite.instances import (
     BUSES,
     CELLS,
@@ -27,7 +28,7 @@ from scenarios.suite.instances import (
     layout,
     scenario_of,
 )
-from scenarios.suite.splits import cell_of_instance, drawn_rows, instance, manifest, split
+from scenarios.suite.splits import cell_of_instance, instance, manifest, split
 
 PLAIN = Axes(heat="warm", arrivals="poisson", due="usual", faults="attended", bus="perfect")
 SMALL = [cell for cell in CELLS if cell.arms <= 8]
@@ -93,7 +94,7 @@ def test_axes_are_honoured() -> None:
     assert {s.due_s for s in at(due="tight").jobs if s.due == "soft"} == {LIGHT_DUE_S["tight"]}
     assert at(faults="unattended").limits.clear_s > 10 * plain.limits.clear_s
     assert [arm.sensor_noise_k for arm in at(faults="noisy").arms] == [None, 2.0] * 3
-    assert at(bus="late").bus == BUSES["late"] != BusSpec()
+    assert at(bus="late").bus == BUSES["late"] != Channel()
     (cut,) = at(bus="cut").bus.partitions
     assert cut.cuts([arm.name for arm in plain.arms]).sum() == 18
     assert [at(heat=level).ambient.points[0][1] for level in FAULTS] == sorted(
@@ -126,7 +127,7 @@ def test_hotter_levels_have_more_faults_of_a_policy_that_ignores_heat() -> None:
 def test_a_default_changes_no_hash() -> None:
     scenario = load("quickstart")
     assert "bus" not in scenario_content(scenario)
-    assert scenario_content(replace(scenario, bus=BusSpec(loss=0.5)))["bus"] == {"loss": 0.5}
+    assert scenario_content(replace(scenario, bus=Channel(loss=0.5)))["bus"] == {"loss": 0.5}
 
 
 def test_an_instance_is_loaded_by_name() -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.freeze_suite import SURPRISE_EVERY
 from fleet.arm.model import ArmModel
 from fleet.env.vector import BatchEnv, Obs
 from fleet.errors import ScenarioError
@@ -16,7 +17,7 @@ from scenarios.prepare.fleet import Fleet, as_known, prepare, with_surprises
 from scenarios.spec.load import load
 from scenarios.spec.parse import override
 from scenarios.spec.schema import SPLITS, Scenario
-from scenarios.suite.instances import CELLS, SURPRISE_EVERY
+from scenarios.suite.instances import CELLS
 from scenarios.suite.splits import manifest
 
 

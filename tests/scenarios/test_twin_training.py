@@ -14,11 +14,10 @@ from fleet.errors import FleetError
 from fleet.motion import drive
 from fleet.robot import ThermalLimits
 from scenarios.evaluate.sources import PlannedFleet
-from scenarios.motion.generate import peak_of
 from scenarios.motion.recover import known_arm
 from scenarios.prepare.arms import PlannedArm, air_offsets, hardware_of, plan_arms
 from scenarios.prepare.calibrate import calibrate_networks, simulate_past
-from scenarios.prepare.twins import quality, train_arms, train_twin, train_twins
+from scenarios.prepare.twins import cold_peaks, quality, train_arms, train_twin, train_twins
 from scenarios.progress import quiet
 from scenarios.run.log import provenance
 from scenarios.spec.jobs import rehearsal_works
@@ -203,12 +202,13 @@ def test_an_arm_begins_from_what_it_found_to_stay_cool(small_toml, plans):
     assert (asked.ambient_c, asked.cool_c, asked.horizon_s) == (22.0, 40.0, 1800.0)
     for plan in known.sources:
         assert plan.arm == "left"
-        peak_c = peak_of(plan, known.arm.motors, known.arm.thermal, asked.ambient_c, asked.horizon_s)
-        assert np.all(peak_c <= 40.0)
+        true = replace(asked, motors=known.arm.motors, thermal=known.arm.thermal)
+        assert np.all(true.peak_c(plan) <= 40.0)
     model = nominal_heat_model("immersion")
     network: Any = SimpleNamespace(heat_model=model)
     own = known_arm(load(small_toml), twin=LEFT, network=network, cache=plans)
-    peak_c = peak_of(own.sources[0], model.motors, model.thermal(), 22.0, 1800.0)
+    law = {"motors": model.motors, "thermal": model.thermal(), "ambient_c": 22.0}
+    (peak_c,) = cold_peaks(own.sources[:1], **law, horizon_s=1800.0)
     np.testing.assert_array_equal(own.verification.peak_c(own.sources[0]), peak_c)
 
 

@@ -52,16 +52,6 @@ class Variation:
     """RMS distance of the joint positions from the source, at equal shares of its time."""
     distance_z: float
     """The same in training standard deviations of each joint."""
-    slowed: float
-    """Largest ratio of a piece's time to its time in the source; 1 if the limits allow the source's speed."""
-
-
-def check_source(source: Plan, s: float) -> None:
-    """Raise ValueError if s is negative or not finite, or the source has no cycle."""
-    if not 0 <= s < np.inf:
-        raise ValueError(f"The perturbation s must be a number >= 0 of posterior standard deviations (got {s}).")
-    if len(source.cycle.profile) == 0:
-        raise ValueError(f"The plan of arm '{source.arm}' has no cycle to vary.")
 
 
 def vary(twin: Twin, source: Plan, s: float, rng: np.random.Generator) -> Variation:
@@ -75,24 +65,25 @@ def vary(twin: Twin, source: Plan, s: float, rng: np.random.Generator) -> Variat
         source: Motion like that on which the twin was trained.
 
     Raises:
-        ValueError: as `check_source`, or the plan has other joints than the twin.
+        ValueError: s is negative or not finite, or the source has no cycle, or other joints than the twin.
     """
-    check_source(source, s)
+    if not 0 <= s < np.inf:
+        raise ValueError(f"The perturbation s must be a number >= 0 of posterior standard deviations (got {s}).")
+    if len(source.cycle.profile) == 0:
+        raise ValueError(f"The plan of arm '{source.arm}' has no cycle to vary.")
     if s > 0 and twin.config.kind == "ae":
         raise ValueError("A plain autoencoder has no posterior to draw from: give s = 0, or a twin of kind vae.")
-    phases, slowed, errors = [], [], []
+    phases, errors = [], []
     paths = [_decoded(twin, resample(phase.profile, RATE_HZ, twin.config.rate_hz), s, rng) for phase in source.phases]
     for phase, path, (begin, end) in zip(source.phases, paths, _phase_ends(source, paths), strict=True):
-        motion, factor = _time_phase(phase, path, begin, end, twin.config.rate_hz, source.speed)
+        motion = _time_phase(phase, path, begin, end, twin.config.rate_hz, source.speed)
         phases.append(motion)
-        slowed.append(factor)
         errors.append(_position_errors(phase, motion))
     error_rad = np.concatenate(errors)
     return Variation(
         phases=tuple(phases),
         distance_rad=float(np.sqrt(np.mean(error_rad**2))),
         distance_z=float(np.sqrt(np.mean((error_rad / twin.scaler.std[:, Q]) ** 2))),
-        slowed=max(slowed),
     )
 
 
@@ -144,14 +135,12 @@ def _phase_ends(source: Plan, paths: Sequence[Array]) -> list[tuple[Array, Array
     return [(home, meet), (meet, meet), (meet, home)]
 
 
-def _time_phase(
-    phase: Phase, path: Array, begin: Array, end: Array, rate_hz: float, speed: float
-) -> tuple[PhaseMotion, float]:
-    """Motion along a decoded path with a rest at each change of payload, and its largest slowdown factor."""
+def _time_phase(phase: Phase, path: Array, begin: Array, end: Array, rate_hz: float, speed: float) -> PhaseMotion:
+    """Motion along a decoded path with a rest at each change of payload."""
     borders_s = np.array([0.0, *(np.flatnonzero(np.diff(phase.payload_kg)) + 1), len(phase.profile)]) / RATE_HZ
     moments = (np.arange(len(path)) + 0.5) / rate_hz
     joints = phase.profile.shape[-1]
-    pieces, loads, slowed = [np.zeros((3, 0, joints))], [], 1.0
+    pieces, loads = [np.zeros((3, 0, joints))], []
     here = begin
     for from_s, to_s in pairwise(borders_s.tolist()):
         if to_s == from_s:
@@ -160,12 +149,12 @@ def _time_phase(
         there = end if last else np.array([np.interp(to_s, moments, q) for q in path.T])
         own = (moments >= from_s) & (moments <= to_s)
         spline = rest_to_rest(moments[own] - from_s, path[own], here, there, to_s - from_s)
-        motion, factor = time_spline(spline, to_s - from_s, speed)
+        motion = time_spline(spline, to_s - from_s, speed)
         pieces.append(motion)
         loads.append(np.full(motion.shape[1], phase.payload_kg[round(from_s * RATE_HZ)]))
-        slowed, here = max(slowed, factor), there
+        here = there
     q, qd, qdd = np.concatenate(pieces, axis=1)
-    return PhaseMotion(q, qd, qdd, np.concatenate([np.zeros(0), *loads])), slowed
+    return PhaseMotion(q, qd, qdd, np.concatenate([np.zeros(0), *loads]))
 
 
 def rest_to_rest(moments_s: Array, path: Array, begin: Array, end: Array, duration_s: float) -> BSpline:
@@ -196,8 +185,8 @@ def rest_to_rest(moments_s: Array, path: Array, begin: Array, end: Array, durati
     return BSpline(knots, control, DEGREE)
 
 
-def time_spline(spline: BSpline, duration_s: float, speed: float) -> tuple[Array, float]:
-    """Position, speed and acceleration along a spline, [3, time, joint], and the ratio of its time to `duration_s`.
+def time_spline(spline: BSpline, duration_s: float, speed: float) -> Array:
+    """Position, speed and acceleration along a spline, [3, time, joint].
 
     The motion takes `duration_s` if the limits allow it, else the shortest time that keeps `speed` times the speed,
     acceleration and jerk of `GEN3`; rounded up to whole samples.
@@ -212,10 +201,9 @@ def time_spline(spline: BSpline, duration_s: float, speed: float) -> tuple[Array
     samples = max(1, int(np.ceil(factor * duration_s * RATE_HZ - 1e-9)))
     shrink = duration_s * RATE_HZ / samples
     moments = np.arange(samples) / RATE_HZ * shrink
-    motion = np.stack(
+    return np.stack(
         [spline.derivative(order)(moments) * shrink**order if order else spline(moments) for order in range(3)]
     )
-    return motion, factor
 
 
 def _position_errors(phase: Phase, motion: PhaseMotion) -> Array:
