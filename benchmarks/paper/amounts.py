@@ -5,15 +5,12 @@
 from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping, Sequence
 from functools import partial
-from itertools import repeat
 
 import numpy as np
 
 from benchmarks.paper.harness import Experiment, Unit, mean_by_group, one_row, table_of, whole
 from benchmarks.paper.subjects import make_study
-from fleet.heat.thermal import NODES, STEP_S, WINDING, temperature_steps
-from fleet.motion import Drive, Plan, drives
-from fleet.robot import JOINTS
+from fleet.heat.thermal import NODES
 from fleet.seeding import child
 from scenarios.json_rows import Row
 from scenarios.prepare.calibrate import AIR_SD_K, own_logs
@@ -27,29 +24,6 @@ MINUTES = (5.0, 10.0, 30.0, 60.0, 120.0, 240.0)
 """Length of the logs. A log has 20 min of light work and 10 min of rest; shorter ones are its begin."""
 LOG_MINUTES = 30.0
 JOBS = 60
-
-
-def peaks_of(twin: RcTwin, plans: Sequence[Plan], repetitions: Sequence[int], start_c: float) -> Array:
-    """Hottest temperature of each motor during each job under the mean load of the job, °C, [plan, joint].
-
-    Args:
-        start_c: Of all nodes, °C.
-    """
-    square, friction = np.zeros((2, len(plans), JOINTS))
-    for i, (plan, times) in enumerate(zip(plans, repetitions, strict=True)):
-        share, phases = plan.weights(times), drives([phase.profile for phase in plan.phases], twin.motors)
-        square[i], friction[i] = share @ phases.current_sq, share @ phases.friction_w
-    duration_s = np.array([plan.duration_s(times) for plan, times in zip(plans, repetitions, strict=True)])
-    steps = int(np.ceil(duration_s.max() / STEP_S))
-    course = temperature_steps(
-        repeat(Drive(square, friction), steps),
-        duration_s / steps,
-        motors=twin.motors,
-        thermal=twin.thermal,
-        start_c=np.full((len(plans), NODES), start_c),
-        ambient_c=twin.ambient_c,
-    )
-    return np.max([temp_c[:, WINDING] for temp_c in course], axis=0)
 
 
 def arm_row(arm: int) -> Row:
@@ -67,7 +41,8 @@ def arm_row(arm: int) -> Row:
     relevant = (true_c > 40.0) & (true_c < 80.0)
 
     def error_k(twin: RcTwin) -> float:
-        peak_c = peaks_of(twin, study.test.plans, study.test.repetitions, study.ambient_c).max(axis=1)
+        start_c = np.full(NODES, study.ambient_c)
+        peak_c = twin.peaks(study.test.plans, study.test.repetitions, start_c=start_c).max(axis=1)
         return float(np.abs(peak_c - true_c)[relevant].mean())
 
     errors = {"0": error_k(RcTwin.nominal(ambient_c=study.ambient_c))}

@@ -16,12 +16,13 @@ from benchmarks.paper.real_logs import (
 )
 from benchmarks.paper.subjects import Study, make_study
 from fleet.errors import FleetError
-from fleet.heat.thermal import WINDING, node_heat
+from fleet.heat.thermal import WINDING
 from fleet.robot import JOINTS
 from scenarios.prepare.calibrate import AIR_SD_K, own_logs
 from tests.logs import COOL, TINY, WARM
 from twin.logs.recording import Recording, cool_stretches, heat_logs
 from twin.thermal.identify import HeatModel, Noise, ParameterVector, Problem, identify, nominal_heat_model
+from twin.thermal.thermal_twin import RcTwin
 
 ONE_EPOCH = replace(TINY, epochs=1)
 
@@ -116,10 +117,9 @@ def test_own_logs_are_what_the_network_simulates(study: Study):
     assert log.time_s[-1] == 400.0
     assert log.temp_c is not None
     # Idle-warm, in the study's air, at the start.
-    nominal = nominal_heat_model()
-    idle_c = nominal.thermal().steady(node_heat(np.zeros(JOINTS), nominal.motors.idle_w), study.ambient_c)[WINDING]
-    np.testing.assert_allclose(log.temp_c[0], idle_c, atol=12.0)
-    layout = ParameterVector(nominal)
+    idle = RcTwin.nominal(ambient_c=study.ambient_c).idle_c[WINDING]
+    np.testing.assert_allclose(log.temp_c[0], idle, atol=12.0)
+    layout = ParameterVector(nominal_heat_model())
     heat = heat_logs(log, layout.nominal.motors, "current", step_s=0.0)
     problem = Problem(heat, study.ambient_c, 0.0, layout, Noise(np.full(JOINTS, 0.01), np.ones(JOINTS)))
     (error_k,) = problem.unexplained(layout.mean)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from benchmarks.paper.amounts import peaks_of
 from benchmarks.paper.subjects import CARRIER, Study, detection, make_study
 from fleet.arm.model import ArmModel
 from fleet.difficulty import SETTLING_S
@@ -236,11 +235,11 @@ def test_jobs_fill_the_horizon(study):
 @pytest.mark.ci_slow
 def test_logs_of_cool_jobs_identify_the_arm(study):
     """Nearer to the truth than a nominal arm, for jobs that overheat too, none of which was logged."""
-    jobs = study.test
+    jobs, start_c = study.test, np.full(NODES, study.ambient_c)
     logs = own_logs(study.hardware, study.train.plans[:2], np.random.default_rng(1), ambient_c=study.ambient_c)
     own = identify(logs, ambient_c=study.ambient_c, ambient_sd_k=AIR_SD_K)
     wrong_k = [
-        peaks_of(rc, jobs.plans, jobs.repetitions, study.ambient_c)[:, CARRIER] - jobs.peak_c[:, CARRIER]
+        rc.peaks(jobs.plans, jobs.repetitions, start_c=start_c)[:, CARRIER] - jobs.peak_c[:, CARRIER]
         for rc in (RcTwin.nominal(ambient_c=study.ambient_c), RcTwin.of(own))
     ]
     assert np.abs(wrong_k[1]).mean() < 0.5 * np.abs(wrong_k[0]).mean()

@@ -1,15 +1,13 @@
 """Forecasts of motor temperatures from the log of an arm, against the simulator's law with the arm's true numbers."""
 
 from dataclasses import replace
-from itertools import repeat
 from typing import Any
 
 import numpy as np
 import pytest
 
 from fleet.errors import FleetError
-from fleet.heat.thermal import STEP_S, temperature_steps
-from fleet.motion import static_drive
+from fleet.heat.thermal import NODES
 from fleet.robot import JOINTS
 from tests.twin.test_identify import AIR_C, FULL_REACH_NM, own_arm, working
 from twin.logs.recording import Recording
@@ -32,10 +30,15 @@ def true_arm(seed: int) -> RcTwin:
 
 
 def course(arm: RcTwin, start_c: np.ndarray, tau: np.ndarray, seconds: float) -> np.ndarray:
-    """Temperatures at the start and after each ten seconds of a hold, °C, [time, node]."""
-    law = {"motors": arm.motors, "thermal": arm.thermal, "ambient_c": arm.ambient_c}
-    steps = repeat(static_drive(tau, arm.motors), round(seconds / STEP_S))
-    return np.stack(list(temperature_steps(steps, STEP_S, start_c=start_c, **law)))
+    """Temperatures after each ten seconds of a hold, °C, [time, node]."""
+    from fleet.motion import static_drive
+
+    drive = static_drive(tau, arm.motors)
+    each = replace(drive, current_sq=drive.current_sq[None], friction_w=drive.friction_w[None])
+    nodes = arm.simulate(each, np.array([seconds]), start_c)[:, 0]
+    at = np.linspace(0.0, seconds, len(nodes))
+    wanted = np.arange(0.0, seconds + 1.0, 10.0)
+    return np.stack([np.interp(wanted, at, nodes[:, n]) for n in range(NODES)], axis=1)
 
 
 @pytest.fixture(scope="module")

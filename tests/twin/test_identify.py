@@ -20,10 +20,12 @@ from fleet.heat.thermal import (
     gen3_network,
     simulate_temperatures,
     spread_motors,
+    steady_state,
     thermal_model,
 )
-from fleet.motion import RATE_HZ, Drive, drives
+from fleet.motion import RATE_HZ, Drive, drive, drives
 from fleet.robot import JOINTS
+from scenarios.prepare.oracle import peaks
 from twin.logs.recording import READINGS, Recording, heat_logs, without_repeats
 from twin.thermal.checkpoint import CARD, load, load_curve, save, save_curve
 from twin.thermal.identify import (
@@ -75,6 +77,47 @@ def holds(make_plan):
     return make
 
 
+def test_three_kilograms_outstretched_pass_the_limit_when_the_project_says(holds):
+    # 12.6 min from a cold arm in 25 °C, DESIGN §3.
+    twin = RcTwin.nominal(ambient_c=25.0)
+    time_s, temp_c = twin.predict(holds(FULL_REACH_NM), 450, np.full(JOINTS, 25.0))
+    assert time_s[-1] == pytest.approx(1801.0)
+    passed_s = np.interp(60.0, temp_c[:, 1], time_s)
+    assert passed_s / 60.0 == pytest.approx(12.6, abs=0.2)
+
+
+def test_peaks_are_those_of_the_simulator_with_the_same_parameters(holds, rng_5):
+    twin = RcTwin.nominal()
+    plans = [holds(scale * FULL_REACH_NM) for scale in (0.3, 0.7, 1.1)]
+    repetitions = [20, 100, 300]
+    start = np.full(NODES, 30.0)
+    mine = twin.peaks(plans, repetitions, start_c=start)
+    lasts = [plan.duration_s(n) for plan, n in zip(plans, repetitions, strict=True)]
+    theirs = peaks(plans, lasts, motors=twin.motors, thermal=twin.thermal, start_c=start, ambient_c=AIR_C)
+    np.testing.assert_allclose(mine, theirs, atol=0.05)  # steps of unequal length
+
+
+def test_a_job_in_phases_ends_where_its_mean_ends(holds):
+    twin = RcTwin.nominal()
+    plan = holds(FULL_REACH_NM)
+    _, temp_c = twin.predict(plan, 50, np.full(JOINTS, 30.0))
+    peak = twin.peaks([plan], [50], start_c=np.full(NODES, 30.0))[0]
+    np.testing.assert_allclose(temp_c.max(axis=0), peak, atol=0.02)
+
+
+def test_difficulty_grows_with_load_and_repetitions_and_is_none_at_rest(holds):
+    twin = RcTwin.nominal()
+    rest = twin.score(holds(np.zeros(JOINTS)), 100)
+    np.testing.assert_allclose(rest.per_joint, 0.0, atol=1e-9)
+    d = [twin.score(holds(s * FULL_REACH_NM), n).per_joint[1] for s, n in ((0.5, 100), (1.0, 100), (1.0, 1000))]
+    assert 0 < d[0] < d[1] < d[2] < 1
+    # The limit is reached where the rise fills the room: d = 1 − 1/e.
+    idle = twin.idle_c[1]
+    at_limit = replace(twin, warning_c=float(twin.peaks([holds(FULL_REACH_NM)], [100], start_c=twin.idle_c)[0, 1]))
+    assert at_limit.warning_c > idle
+    assert at_limit.score(holds(FULL_REACH_NM), 100).per_joint[1] == pytest.approx(1 - np.exp(-1))
+
+
 def test_the_peak_is_that_of_the_step_by_step_simulation(holds):
     """Hot and cold starts, short and long plans, copper and magnets that change with temperature."""
     twin, rng = RcTwin.nominal(), np.random.default_rng(1)
@@ -92,7 +135,7 @@ def test_the_peak_is_that_of_the_step_by_step_simulation(holds):
         wanted_c = simulate_temperatures(load, [after_s], start_c=settled.end_c[0], **law).highest_c.max()
         known_c = known_temperatures(start_c[:JOINTS], housing_c, ambient_c)
         if wanted_c < 90.0:  # beyond the error limit nothing needs to be right
-            errors.append(twin.peak(plan, times).value(known_c) - wanted_c)
+            errors.append(twin.score(plan, times).peak_at(known_c) - wanted_c)
     assert len(errors) > 30
     assert np.sqrt(np.mean(np.square(errors))) < 0.3
     assert np.abs(errors).max() < 1.0
@@ -101,10 +144,10 @@ def test_the_peak_is_that_of_the_step_by_step_simulation(holds):
 def test_a_plan_that_cools_a_warm_motor_is_not_held_against_it(holds):
     twin = replace(RcTwin.nominal(), curve=PeakCurve(knots=((59.0, 0.01), (61.0, 0.99)), jobs=30))
     warm_c = known_temperatures(np.append(65.0, np.full(6, 30.0)), np.full(JOINTS, 30.0), 22.0)
-    light = twin.peak(holds(0.0 * FULL_REACH_NM), 2000)
-    assert light.at(warm_c) == 0.01
+    light = twin.score(holds(0.0 * FULL_REACH_NM), 2000)
+    assert light.p_at(warm_c) == 0.01
     hot_c = known_temperatures(np.full(JOINTS, 70.0), np.full(JOINTS, 68.0), 36.0)
-    assert light.at(hot_c) == 0.99
+    assert light.p_at(hot_c) == 0.99
 
 
 def test_pieces_of_later_moments_say_so(holds):
@@ -130,12 +173,14 @@ def test_a_curve_is_the_chance_of_the_prediction_error(holds):
 def test_bad_plans_are_refused(holds, make_plan):
     twin, empty = RcTwin.nominal(), np.zeros((0, 3, JOINTS), np.float32)
     with pytest.raises(ValueError, match="at least one repetition"):
-        twin.peak(holds(FULL_REACH_NM), 0)
+        twin.score(holds(FULL_REACH_NM), 0)
     with pytest.raises(ValueError, match="no motion"):
-        twin.peak(make_plan(empty, empty, empty), 1)
+        twin.score(make_plan(empty, empty, empty), 1)
     six = np.zeros((50, 3, 6), np.float32)
     with pytest.raises(ValueError, match="7 joints"):
-        twin.peak(make_plan(six, six, six), 1)
+        twin.score(make_plan(six, six, six), 1)
+    with pytest.raises(ValueError, match="start_c"):
+        twin.predict(holds(FULL_REACH_NM), 1, np.zeros(3))
 
 
 def working(twin: RcTwin, minutes: float, rng: np.random.Generator) -> tuple[Recording, np.ndarray]:
@@ -171,16 +216,18 @@ def test_an_identified_arm_predicts_its_own_heat_better_than_the_nominal_one(hol
     recordings = [replace(working(true, 40.0, rng_5)[0], name=f"{i}") for i in range(2)]
     got = identify(recordings, ambient_sd_k=0.0, step_s=20.0)
     plans = [holds(s * FULL_REACH_NM) for s in (0.5, 0.8, 1.1)]
-    known_c = known_temperatures(np.full(JOINTS, 30.0), np.full(JOINTS, 30.0), AIR_C)
-    save(got, tmp_path)
-    wanted, *predicted = (
-        np.array([twin.peak(plan, 200).value(known_c) for plan in plans])
-        for twin in (true, nominal, RcTwin.of(got), RcTwin.of(load(tmp_path)))
-    )
-    error = [np.abs(peak_c - wanted).max() for peak_c in predicted]
+    start = np.full(NODES, 30.0)
+    wanted = true.peaks(plans, [200] * 3, start_c=start)[:, 1]
+    error = [
+        np.abs(twin.peaks(plans, [200] * 3, start_c=start)[:, 1] - wanted).max() for twin in (nominal, RcTwin.of(got))
+    ]
     assert error[1] < min(0.5 * error[0], 0.5)
-    assert RcTwin.of(load(tmp_path)).version == RcTwin.of(got).version
-    np.testing.assert_array_equal(predicted[2], predicted[1])
+    save(got, tmp_path)
+    kept, back = RcTwin.of(got), RcTwin.of(load(tmp_path))
+    assert back.version == kept.version
+    np.testing.assert_array_equal(
+        back.peaks(plans, [200] * 3, start_c=start), kept.peaks(plans, [200] * 3, start_c=start)
+    )
     curve = PeakCurve(knots=((59.0, 0.1), (61.0, 0.9)), jobs=30)
     save_curve(curve, tmp_path)
     assert load_curve(tmp_path) == curve
@@ -217,6 +264,15 @@ def test_probability_from_past_jobs_of_an_arm_unlike_the_nominal_one(holds):
     assert 0.1 < passed.mean() < 0.9
     assert brier_score_loss(passed[taught:], p) <= 0.045
     assert calibration_error(p, passed[taught:]) <= 0.04
+
+
+def test_the_warm_end_is_where_newton_says_it_settles(holds):
+    twin = RcTwin.nominal()
+    plan = holds(0.5 * FULL_REACH_NM)
+    load = drive(plan.cycle.profile, twin.motors)
+    end = steady_state(twin.thermal, load.current_sq, load.friction_w, twin.motors, AIR_C)
+    _, temp_c = twin.predict(plan, 15000, np.full(JOINTS, 30.0))
+    np.testing.assert_allclose(temp_c[-1], end[WINDING], atol=0.05)
 
 
 def test_a_calibrated_twin_states_what_each_model_states(twin, plan) -> None:

@@ -8,14 +8,15 @@ each motor at each moment is affine in the temperatures known at the start, and 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from itertools import repeat
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fleet.difficulty import KNOWN, SETTLING_S, Difficulty, Forecast
+from fleet.difficulty import KNOWN, SETTLING_S, Difficulty, Forecast, difficulty_of_error
 from fleet.errors import FleetError
 from fleet.heat.motor import Motors, copper_loss, magnet_factor
-from fleet.heat.thermal import NODES, WINDING, ThermalModel, node_heat
+from fleet.heat.thermal import NODES, STEP_S, WINDING, ThermalModel, node_heat, temperature_steps
 from fleet.motion import Drive, Plan, drives
 from fleet.robot import JOINTS, Cooling, ThermalLimits
 from twin.thermal.identify import AMBIENT_C, HeatModel, Identified, nominal_heat_model
@@ -188,7 +189,11 @@ def fit_curve(predicted_c: Array, peak_c: Array, limit_c: float) -> PeakCurve:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RcTwin:
-    """One arm's resistance-capacitance network, which predicts the peak of plans, and P(saturation)."""
+    """One arm's resistance-capacitance network as a twin; implements `fleet.difficulty.DifficultyModel`.
+
+    d_k = 1 − exp(−rise_k / room_k): the predicted rise of motor k above its idle temperature over the room from there
+    to the warning limit.
+    """
 
     arm: str
     heat_model: HeatModel
@@ -227,16 +232,88 @@ class RcTwin:
         """The arm's network as matrices."""
         return self.heat_model.thermal()
 
-    def peak(self, plan: Plan, repetitions: int) -> Forecast:
-        """Hottest motor during a job, °C, from the temperatures at its start; with the curve to P(saturation).
+    @cached_property
+    def idle_c(self) -> Array:
+        """Steady temperatures of the powered arm without load, °C, [node]."""
+        return self.thermal.steady(node_heat(np.zeros(JOINTS), self.motors.idle_w), self.ambient_c)
+
+    def likely_start(self, temp_c: Array) -> Array:
+        """Node temperatures for measured motor temperatures, °C, [..., joint] to [..., node].
+
+        Housings have no sensor and count as warm as their windings: true after minutes of rest, cautious after work.
+        """
+        return np.concatenate([temp_c, temp_c], axis=-1)
+
+    def score(self, plan: Plan, repetitions: int) -> Difficulty:
+        """Difficulty of the repeated plan, and its peak as a function of the temperatures at the start.
 
         Raises:
             ValueError: repetitions < 1, or a plan without motion or with other joints.
         """
+        peak = self.peaks([plan], [repetitions], start_c=self.idle_c)[0]
+        idle = self.idle_c[WINDING]
+        rise = np.maximum(peak - idle, 0.0) / np.maximum(self.warning_c - idle, 1.0)
+        # Beyond this 1 − exp(−e) rounds to one; d_k stays below it.
+        per_joint = difficulty_of_error(np.minimum(rise, 30.0))
+        return Difficulty(per_joint, peak=self.peak(plan, repetitions))
+
+    def peaks(self, plans: Sequence[Plan], repetitions: Sequence[int], *, start_c: Array) -> Array:
+        """Hottest temperature of each motor during each job, °C, [plan, joint].
+
+        Args:
+            start_c: [node], or [plan, node]; `likely_start` makes it from measured temperatures.
+        """
+        self._check(plans, repetitions)
+        square, friction = np.zeros((2, len(plans), JOINTS))
+        for i, (plan, times) in enumerate(zip(plans, repetitions, strict=True)):
+            share, phases = plan.weights(times), drives([phase.profile for phase in plan.phases], self.motors)
+            square[i], friction[i] = share @ phases.current_sq, share @ phases.friction_w
+        duration_s = [plan.duration_s(times) for plan, times in zip(plans, repetitions, strict=True)]
+        return self.simulate(Drive(square, friction), np.array(duration_s), start_c)[..., WINDING].max(axis=0)
+
+    def simulate(self, load: Drive, duration_s: Array, start_c: Array) -> Array:
+        """Node temperatures under constant drives [job, joint], °C, [step + 1, job, node].
+
+        Every job has the same number of steps, equal within it, at most `fleet.heat.thermal.STEP_S` long.
+        """
+        steps = max(1, int(np.ceil(np.max(duration_s, initial=0.0) / STEP_S)))
+        rows = temperature_steps(
+            repeat(load, steps),
+            np.asarray(duration_s, dtype=float) / steps,
+            motors=self.motors,
+            thermal=self.thermal,
+            start_c=np.broadcast_to(start_c, (len(duration_s), NODES)).astype(float),
+            ambient_c=self.ambient_c,
+        )
+        return np.stack(list(rows))
+
+    def predict(self, plan: Plan, repetitions: int, start_c: Array) -> tuple[Array, Array]:
+        """Motor temperatures during a job: approach, cycles and retreat, each with its own mean heat.
+
+        Args:
+            start_c: Measured motor temperatures [joint], or estimates of all nodes [node].
+
+        Returns:
+            Time since the start, s, [time], and temperatures, °C, [time, joint].
+        """
+        self._check([plan], [repetitions])
+        temp = self.likely_start(start_c) if len(start_c) == JOINTS else np.asarray(start_c, dtype=float)
+        if temp.shape != (NODES,):
+            raise ValueError(f"start_c must be [{JOINTS}] or [{NODES}] (got shape {np.shape(start_c)}).")
+        times, temps, now_s = [np.zeros(1)], [temp[None]], 0.0
+        for phase, count in zip(plan.phases, (1, repetitions, 1), strict=True):
+            lasts_s = phase.duration_s * count
+            if lasts_s > 0:
+                part = self.simulate(drives([phase.profile], self.motors), np.array([lasts_s]), temps[-1][-1])[:, 0]
+                times.append(now_s + lasts_s * np.arange(1, len(part)) / (len(part) - 1))
+                temps.append(part[1:])
+                now_s += lasts_s
+        return np.concatenate(times), np.concatenate(temps)[:, WINDING]
+
+    def peak(self, plan: Plan, repetitions: int) -> Forecast:
+        """Hottest motor during a job, °C, from the temperatures at its start; with the curve to P(saturation)."""
         if plan not in self._heat:
-            check_jobs([plan], [repetitions])
-            if (joints := plan.cycle.profile.shape[-1]) != JOINTS:
-                raise ValueError(f"The thermal network has {JOINTS} joints (got {joints}).")
+            self._check([plan], [repetitions])
             load = drives([phase.profile for phase in plan.phases], self.motors)
             self._heat[plan] = LinearHeat.of(load, self.motors, self.thermal)
         lasts_s = plan.duration_s(repetitions) * plan.weights(repetitions)
@@ -257,6 +334,12 @@ class RcTwin:
         jobs = zip(plans, repetitions, known_c, strict=True)
         predicted_c = [float(self.peak(plan, int(times)).value(known)) for plan, times, known in jobs]
         return replace(self, curve=fit_curve(np.array(predicted_c), peak_c, self.warning_c))
+
+    def _check(self, plans: Sequence[Plan], repetitions: Sequence[int]) -> None:
+        check_jobs(plans, repetitions, least=0)
+        for plan in plans:
+            if plan.cycle.profile.shape[-1] != JOINTS:
+                raise ValueError(f"The thermal network has {JOINTS} joints (got {plan.cycle.profile.shape[-1]}).")
 
 
 @dataclass(frozen=True, eq=False)
