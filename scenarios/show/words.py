@@ -8,6 +8,7 @@ from fleet.events import Event
 from scenarios.spec.calendar import date_at
 
 if TYPE_CHECKING:  # slow to import
+    from fleet.bus.protocol.auction import ArmEvent
     from scenarios.run.records import Offer
 
 SEVERITY = {
@@ -60,11 +61,11 @@ def kind_text(kind: str) -> str:
     return LABELS.get(kind, kind.replace("_", " "))
 
 
-def event_text(event: Event) -> str:
-    """An event in words."""
+def event_text(event: "Event | ArmEvent") -> str:
+    """An event in words, without its time and arm."""
     joint = f", joint {event.joint}" if event.joint else ""
     reason = f": {event.reason}" if event.reason else ""
-    return f"{event.kind.replace('_', ' ')}{f' {event.job}' if event.job else ''}{joint}{reason}"
+    return f"{kind_text(event.kind)}{f' {event.job}' if event.job else ''}{joint}{reason}"
 
 
 def offer_text(offer: "Offer") -> str:
