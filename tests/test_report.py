@@ -22,6 +22,7 @@ from fleet.events import Event
 from fleet.robot import ThermalLimits
 from fleet.telemetry import Telemetry
 from scenarios.run.records import JobRecord, Offer, ShiftLog
+from scenarios.show.charts import decimate
 from scenarios.show.run_page import (
     ROWS,
     figure_table,
@@ -32,7 +33,7 @@ from scenarios.show.run_page import (
     runs_page,
     verdict,
 )
-from scenarios.show.timeline import decimate, figure, stream_of
+from scenarios.show.timeline import figure, stream_of
 
 ARMS = ("arm_0", "arm_1")
 HOSTILE = '</script><img src="https://evil.example/x"><b>-001'

@@ -13,7 +13,9 @@ from scenarios.evaluate.comparison import Comparison, Failed, by_reward
 from scenarios.evaluate.scores import FEWEST, HEADS, Normalised, SuiteScores, ranked, score_cells, scores_of
 from scenarios.evaluate.statistics import LEGEND, LEVEL, Interval, profile
 from scenarios.policy_loader import is_on_bus, label
-from scenarios.show.page import LAYOUT, LEGEND_ABOVE, Chart, Figure, Page, axis, named_rows, plain
+from scenarios.show import charts
+from scenarios.show.charts import COLOURS, LAYOUT, MARGIN, SYMBOLS, Figure, Trace, axis, plain
+from scenarios.show.page import Chart, Page
 from scenarios.show.words import value_text
 from scenarios.table import Column, Table
 
@@ -33,15 +35,8 @@ MOST_FAILURES, MOST_TRACES = 20, 8
 THRESHOLDS = np.linspace(-0.5, 1.1, 81)
 WORST = -1.5
 """Scores below are cut in charts."""
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a8a8a", "#7a5195")
-"""Of lines (Okabe & Ito, who are for colour-blind readers, and two more)."""
-DASHES, SYMBOLS = ("solid", "dash", "dot", "dashdot"), ("circle", "square", "diamond", "x")
-"""Of lines and points, which tell equal colours apart."""
-HEIGHT_PX, ROW_PX = 428, 24
-"""Of a chart with a legend, and of a row of `spans`."""
-MARGIN = {"l": 60, "r": 20, "t": 12, "b": 48}
-WITH_LEGEND: dict[str, Any] = LAYOUT | {"height": HEIGHT_PX, "margin": MARGIN | {"t": 40}, "legend": LEGEND_ABOVE}
-WITH_LEGEND |= {"showlegend": True}
+ROW_PX = 24
+"""Of `spans`."""
 NAME = 28
 """Most characters of a policy's name in a chart."""
 
@@ -333,9 +328,9 @@ def spans(rows: Sequence[tuple[str, float, float, float]], title: str, *, least:
     return {
         "data": [_dots(values, at, names, {"marker": {"color": COLOURS[0], "size": 9}})],
         "layout": LAYOUT
-        | {"height": MARGIN["t"] + ROW_PX * len(rows) + MARGIN["b"], "margin": MARGIN}
+        | {"height": 12 + ROW_PX * len(rows) + MARGIN["b"], "margin": MARGIN | {"t": 12}}
         | {"annotations": cut, "showlegend": False}
-        | {"xaxis": axis(title, range=[low - room, high + room]), "yaxis": named_rows(labels)},
+        | {"xaxis": axis(title, range=[low - room, high + room]), "yaxis": charts.named_rows(labels)},
     }
 
 
@@ -353,21 +348,14 @@ def lines(
         by_name: Value, low and high of each curve, [point].
         banded: Curves whose low and high are shown.
     """
-    x = x_values.round(4).tolist()
-    bands, curves = list[dict[str, Any]](), list[dict[str, Any]]()
+    bands, curves = list[Trace](), list[Trace]()
     for n, (name, (value, low, high)) in enumerate(by_name.items()):
-        colour, dash = COLOURS[n % len(COLOURS)], DASHES[n // len(COLOURS) % len(DASHES)]
         if name in banded:
-            around = {"x": [*x, *x[::-1]], "y": [*high.round(4).tolist(), *low.round(4).tolist()[::-1]]}
-            look = {"fill": "toself", "fillcolor": colour, "opacity": 0.12, "line": {"width": 0}, "hoverinfo": "skip"}
-            bands.append({"type": "scatter", "mode": "lines", "showlegend": False, **around, **look})
-        line = {"color": colour, "width": 2, "dash": dash}
-        curve = {"x": x, "y": value.round(4).tolist(), "line": line}
-        curves.append({"type": "scatter", "mode": "lines", "name": plain(name, NAME), **curve})
-    return {
-        "data": [*bands, *curves],
-        "layout": WITH_LEGEND | {"xaxis": axis(x_title, range=[x[0], x[-1]]), "yaxis": axis(y_title, range=[0, 1.02])},
-    }
+            bands.append(charts.band(x_values, low, high, charts.look_of(n)["color"], showlegend=False))
+        curves.append(charts.curve(plain(name, NAME), x_values, value, charts.look_of(n)))
+    ends = {"range": x_values[[0, -1]].tolist()}
+    axes = {"xaxis": axis(x_title, **ends), "yaxis": axis(y_title, range=[0, 1.02])}
+    return {"data": [*bands, *curves], "layout": charts.WITH_LEGEND | axes}
 
 
 def points(rows: Sequence[tuple[str, Range, Range]], x_title: str, y_title: str) -> Figure:
@@ -376,20 +364,20 @@ def points(rows: Sequence[tuple[str, Range, Range]], x_title: str, y_title: str)
     Args:
         rows: Name, x and y; each of the two with its lower and upper bound.
     """
-    data = list[dict[str, Any]]()
+    data = list[Trace]()
     for n, (name, x, y) in enumerate(rows):
         marker = {"color": COLOURS[n % len(COLOURS)], "symbol": SYMBOLS[n // len(COLOURS) % len(SYMBOLS)], "size": 9}
         data.append(_dots(np.array([x]), np.array([y]), [name], {"name": plain(name, NAME), "marker": marker}))
-    return {"data": data, "layout": WITH_LEGEND | {"xaxis": axis(x_title), "yaxis": axis(y_title)}}
+    return {"data": data, "layout": charts.WITH_LEGEND | {"xaxis": axis(x_title), "yaxis": axis(y_title)}}
 
 
-def _dots(x: Array, y: Array, names: Sequence[str], look: dict[str, Any]) -> dict[str, Any]:
+def _dots(x: Array, y: Array, names: Sequence[str], look: Trace) -> Trace:
     """Markers with their intervals, and their names as hover texts.
 
     Args:
         x, y: Value, low and high of each point, [point, 3]; NaN for an unknown end.
     """
-    trace: dict[str, Any] = {"type": "scatter", "mode": "markers", "x": x[:, 0].tolist(), "y": y[:, 0].tolist()}
+    trace: Trace = {"type": "scatter", "mode": "markers", "x": x[:, 0].tolist(), "y": y[:, 0].tolist()}
     for name, values in (("x", x), ("y", y)):
         below, above = np.nan_to_num(np.abs(values[:, 1:] - values[:, :1]), posinf=0.0).T.tolist()
         bars = {"type": "data", "symmetric": False, "array": above, "arrayminus": below, "thickness": 1.5, "width": 0}

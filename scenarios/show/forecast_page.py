@@ -7,8 +7,8 @@ from typing import Any  # values of JSON and of Plotly's schema
 import numpy as np
 
 from fleet.robot import JOINTS, ThermalLimits
-from scenarios.show.comparison_page import COLOURS
-from scenarios.show.page import GRID, INK, LAYOUT, LEGEND_ABOVE, Chart, Section, axis, sections_page
+from scenarios.show import charts
+from scenarios.show.page import Chart, Section, sections_page
 from scenarios.show.words import duration
 from scenarios.table import Column, Table
 from twin.logs.recording import Recording
@@ -154,52 +154,32 @@ def _chart(found: ThermalForecast, so_far: Recording) -> Chart:
     low, middle, high = found.interval()
     hottest = int(middle[-1].argmax())
     measured = so_far.part(so_far.time_s >= so_far.time_s[-1] - max(found.run_s, 30 * MINUTE_S))
-    before = np.unique(np.linspace(0, len(measured.time_s) - 1, MOST_POINTS).round().astype(int))
-    after = np.unique(np.linspace(0, len(middle) - 1, MOST_POINTS).round().astype(int))
-    past = (measured.time_s[before] - so_far.time_s[-1]) / MINUTE_S
-    ahead = found.time_s[found.in_run][after] / MINUTE_S
     assert measured.temp_c is not None, "a forecast starts from temperatures"
-    band = {
-        "type": "scatter",
-        "x": [*ahead.tolist(), *ahead[::-1].tolist()],
-        "y": [*high[after, hottest].tolist(), *low[after, hottest][::-1].tolist()],
-        "fill": "toself",
-        "fillcolor": f"{COLOURS[hottest]}33",
-        "line": {"width": 0},
-        "hoverinfo": "skip",
-        "name": f"95 % interval of joint {hottest + 1}",
+    ahead = found.time_s[found.in_run] / MINUTE_S
+    minutes = np.append((measured.time_s - so_far.time_s[-1]) / MINUTE_S, ahead)
+    temp_c = np.concatenate([measured.temp_c, middle])
+    name, colour = f"95 % interval of joint {hottest + 1}", charts.JOINT_LINES[hottest][0]
+    data = [charts.band(ahead, low[:, hottest], high[:, hottest], colour, name=name)]
+    for j, (colour, dash) in enumerate(charts.JOINT_LINES):
+        look = {"color": colour, "dash": dash, "width": 2.5 if j == hottest else 1.3}
+        data.append(charts.curve(f"joint {j + 1}", minutes, temp_c[:, j], look, most=MOST_POINTS))
+    lines, labels = charts.limit_lines(ThermalLimits())
+    now = {
+        "type": "line",
+        "x0": 0,
+        "x1": 0,
+        "yref": "paper",
+        "y0": 0,
+        "y1": 1,
+        "line": {"color": charts.INK, "width": 1},
     }
-    lines = [
-        {
-            "type": "scatter",
-            "mode": "lines",
-            "name": f"joint {j + 1}",
-            "x": [*past.tolist(), *ahead.tolist()],
-            "y": np.round([*measured.temp_c[before, j], *middle[after, j]], 2).tolist(),
-            "line": {"color": COLOURS[j], "width": 2.5 if j == hottest else 1.3},
-        }
-        for j in range(JOINTS)
-    ]
-    most_c = max(float(high.max()), float(measured.temp_c.max()))
-    shown_c = [limit_c for limit_c in LIMITS_C[1:] if limit_c < most_c + 15.0]
-    layout = LAYOUT | {
-        "height": 430,
-        "margin": {"l": 55, "r": 15, "t": 60, "b": 50},
-        "legend": LEGEND_ABOVE,
-        "xaxis": axis("minutes from the end of the log"),
-        "yaxis": axis("motor temperature, °C"),
-        "shapes": [*(_rule("x", "y", c, "#b00020") for c in shown_c), _rule("y", "x", 0.0, GRID)],
-        "annotations": [
-            {"xref": "paper", "x": 1, "xanchor": "right", "y": c, "yanchor": "bottom", "showarrow": False}
-            | {"text": f"{c:g} °C", "font": {"color": INK}}
-            for c in shown_c
-        ],
+    shown_c = charts.range_c(np.concatenate([measured.temp_c, high]), ThermalLimits())
+    layout = charts.WITH_LEGEND | {
+        "margin": charts.MARGIN | {"r": charts.LIMITS_PX, "t": 60},
+        "xaxis": charts.axis("minutes from the end of the log"),
+        "yaxis": charts.axis("motor temperature, °C", range=shown_c),
+        "shapes": [*lines, now],
+        "annotations": labels,
     }
     alt = f"Motor temperatures before and in the run; joint {hottest + 1} ends at {middle[-1, hottest]:.1f} °C"
-    return Chart(key="forecast_chart", figure={"data": [band, *lines], "layout": layout}, alt=alt)
-
-
-def _rule(across: str, axis: str, value: float, colour: str) -> dict[str, Any]:
-    """A straight line through the whole chart at a value of an axis."""
-    ends = {f"{across}ref": "paper", f"{across}0": 0, f"{across}1": 1, f"{axis}0": value, f"{axis}1": value}
-    return {"type": "line", "line": {"color": colour, "dash": "dash", "width": 1.3}, **ends}
+    return Chart(key="forecast_chart", figure={"data": data, "layout": layout}, alt=alt)

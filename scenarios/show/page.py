@@ -2,7 +2,6 @@
 
 import base64
 import gzip
-import html
 import io
 import json
 import re
@@ -19,13 +18,12 @@ from zipfile import ZipFile
 import numpy as np
 from markupsafe import Markup
 
-from fleet.errors import FleetError, install, visible
+from fleet.errors import FleetError, install
 from fleet.telemetry import Telemetry
+from scenarios.show.charts import Figure
 from scenarios.table import Table, render, static
 
 Array = np.ndarray
-Figure = Mapping[str, Any]
-"""`data` and `layout` in Plotly's schema: a plain dict, because Plotly's own objects take longer than a report."""
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data: blob:; form-action 'none'; base-uri 'none'"
 """The browser itself prevents every request."""
@@ -37,37 +35,6 @@ _PLOTLY_OPTIONS = {
     "showSendToCloud": False,
     "plotlyServerURL": "",
 }
-INK, GRID, FRAME = "#222222", "#e6e6e6", "#bbbbbb"
-LAYOUT = {
-    "template": "none",
-    "font": {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 12, "color": INK},
-    "paper_bgcolor": "white",
-    "plot_bgcolor": "white",
-    "hovermode": "closest",
-    "hoverlabel": {"align": "left", "bgcolor": "white", "bordercolor": FRAME, "font": {"color": INK}},
-}
-"""Of every figure; a dark page changes its colours."""
-AXIS = {"showgrid": True, "gridcolor": GRID, "zeroline": False, "linecolor": FRAME, "ticks": "outside"}
-LEGEND_ABOVE = {"orientation": "h", "x": 0, "y": 1.02, "xanchor": "left", "yanchor": "bottom"}
-
-
-def axis(title: str, **more: Any) -> dict[str, Any]:
-    """An axis with a title; `more` in Plotly's schema."""
-    return AXIS | {"title": {"text": title}} | more
-
-
-def named_rows(names: Sequence[str], **more: Any) -> dict[str, Any]:
-    """A y axis of rows with names, the first at the top; `more` in Plotly's schema."""
-    ticks = {"tickvals": list(range(len(names))), "ticktext": list(names), "range": [len(names) - 0.5, -0.5]}
-    return AXIS | ticks | {"automargin": True, "showgrid": False} | more
-
-
-def plain(text: str, most: int | None = None) -> str:
-    """Text escaped for Plotly, which interprets some HTML and `%{…}`; with `most`, its start and end are kept."""
-    shown = visible(text)
-    if most is not None and len(shown) > most:
-        shown = f"{shown[: most - most // 2 - 1]}…{shown[-(most // 2) :]}"
-    return html.escape(shown, quote=False).replace("%{", "%&#123;")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -15,7 +15,7 @@ from matplotlib.patches import Circle, Polygon
 from fleet.arm.kinematics import FOREARM_M, HAND_M, REACH_M, UPPER_ARM_M
 from fleet.env.render.picture import FAULT, INK, outlines
 from fleet.env.render.scene import mount_kind
-from scenarios.show.comparison_page import COLOURS
+from scenarios.show.charts import COLOURS
 from scenarios.show.layout import LayoutReport, shoulder_m
 from scenarios.spec.schema import Scenario
 

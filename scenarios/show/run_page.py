@@ -14,18 +14,9 @@ import numpy as np
 from fleet.env.render.heat import heat_scale
 from fleet.events import Event
 from scenarios.run.records import JobSpan, Offer, ShiftLog
-from scenarios.show.page import (
-    AXIS,
-    LAYOUT,
-    Chart,
-    Figure,
-    Page,
-    Playback,
-    named_rows,
-    packed,
-    plain,
-)
-from scenarios.show.timeline import POLICY_LINES, STREAM_NAME, figure, hottest_motors, stream_of, time_unit
+from scenarios.show.charts import AXIS, COLOURS, LAYOUT, Figure, named_rows, plain
+from scenarios.show.page import Chart, Page, Playback, packed
+from scenarios.show.timeline import STREAM_NAME, figure, hottest_motors, stream_of, time_unit
 from scenarios.show.words import clock, duration, kind_text, names_text, offer_text, value_text
 from scenarios.table import Column, Moment, Table, render
 
@@ -734,7 +725,7 @@ def bars(logs: Mapping[str, ShiftLog]) -> Figure:
         own = [each.get(name) for each in values]
         text = [f"{value:{form}}" if value is not None else "" for value in own]
         axes = {"xaxis": f"x{number}", "yaxis": f"y{number}"}
-        look = {"color": [POLICY_LINES[k % len(POLICY_LINES)][0] for k in range(len(names))]}
+        look = {"color": [COLOURS[k % len(COLOURS)] for k in range(len(names))]}
         data.append(
             {"type": "bar", "orientation": "h", "x": own, "y": list(range(len(own))), "text": text, "marker": look}
             | {

@@ -1,31 +1,26 @@
-"""Plotly figures of shifts: Gantt chart above and motor temperatures below, or the hottest motors of several shifts.
-
-The figures are plain dicts in Plotly's schema, because Plotly's own objects take longer than the rest of a report.
-"""
+"""Figures of shifts: Gantt chart above and motor temperatures below, or the hottest motors of several shifts."""
 
 import base64
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
-from itertools import cycle
 from typing import Any, TypeVar  # Any: values of Plotly's schema
 
 import numpy as np
 
 from fleet.env.render.heat import HEAT, heat_marks
 from fleet.events import Event
-from fleet.robot import JOINTS, ThermalLimits
+from fleet.robot import JOINTS
 from fleet.telemetry import Telemetry
 from scenarios.run.records import JobSpan, Outage, ShiftLog
-from scenarios.show import page
-from scenarios.show.page import AXIS, INK, axis, plain
+from scenarios.show import charts
+from scenarios.show.charts import AXIS, FAULT, INK, LAYOUT, WARNING, Trace, plain
 from scenarios.show.words import clock, duration
 
 Array = np.ndarray
-Trace = dict[str, Any]
 Span = TypeVar("Span", JobSpan, Outage)
 
 STREAM_COLOURS = ("#4477aa", "#ddaa33", "#228833", "#aa4499", "#66ccee", "#997755", "#999933", "#555566")
-FAULT, WARNING, FAILURE, BREAK = "#cc2222", "#e08a00", "#444444", "#8a8a8a"
+FAILURE, BREAK = "#444444", "#8a8a8a"
 BAR = {"type": "bar", "orientation": "h", "legend": "legend"}
 BAR_HEIGHT, BREAK_HEIGHT = 0.62, 0.24
 """In rows; an arm may work in a break."""
@@ -46,29 +41,7 @@ MOST_LANES, HOTTEST = 16, 5
 HEAT_BINS = 1440
 """Columns of the heat map."""
 
-JOINT_LINES = (
-    ("#4a6fd0", "longdashdot"),
-    ("#cc6677", "solid"),
-    ("#228a44", "dash"),
-    ("#2f8fb5", "dot"),
-    ("#b554a8", "longdash"),
-    ("#8a8a2a", "1px,5px"),
-    ("#2f9488", "dashdot"),
-)
-"""Colour and dash of each joint. Each colour has a contrast above 3 on light and dark pages; the dashes tell apart what
-looks alike to people who see few colours."""
-
-POLICY_LINES = (
-    ("#0072b2", "solid"),
-    ("#d55e00", "dash"),
-    ("#009e73", "dot"),
-    ("#cc79a7", "longdash"),
-    ("#a07800", "dashdot"),
-    ("#7a5195", "longdashdot"),
-)
-"""Colour and dash of each of several shifts."""
-
-MARGIN = {"l": 90, "r": 84, "b": 52}
+MARGIN = {"l": 90, "r": charts.LIMITS_PX, "b": 52}
 NARROW_PX = 860
 """Width of the plotting area on a small laptop; a legend wraps at this width."""
 LEGEND_ROW_PX = 20.0
@@ -79,7 +52,7 @@ GAP_PX = 172.0
 """Height between the two blocks, for an axis, a title and a legend."""
 BETWEEN_LANES_PX = 28.0
 
-LAYOUT = page.LAYOUT | {"modebar": {"orientation": "v"}, "barmode": "overlay", "dragmode": "zoom"}
+SHIFT_LAYOUT = LAYOUT | {"modebar": {"orientation": "v"}, "barmode": "overlay", "dragmode": "zoom"}
 LEGEND = {
     "orientation": "h",
     "x": 0,
@@ -103,16 +76,21 @@ def figure(log: ShiftLog) -> dict[str, Any]:
         "title": {"text": _time_title(log, unit), "standoff": 6},
         "domain": [0, 1],
     }
-    layout = LAYOUT | _blocks(arms, lanes, _legend_height(bars))
+    layout = SHIFT_LAYOUT | _blocks(arms, lanes, _legend_height(bars))
     layout["xaxis"] = time | {"anchor": "y"}
     layout["xaxis2"] = time | {"anchor": f"y{len(lanes) + 1}", "matches": "x"}
     title = {"text": "°C", "standoff": 8}
-    temperature = AXIS | {"range": _range_c(telemetry.temp_c, log.limits), "title": title, "anchor": "x2", "nticks": 6}
+    temperature = AXIS | {
+        "range": charts.range_c(telemetry.temp_c, log.limits),
+        "title": title,
+        "anchor": "x2",
+        "nticks": 6,
+    }
     layout["shapes"] = []
     for lane in range(len(lanes)):
         key = f"yaxis{lane + 2}"
         layout[key] = temperature | layout[key] | ({"matches": "y2"} if lane else {})
-        shapes, labels = _limit_lines(log.limits, f"y{lane + 2}")
+        shapes, labels = charts.limit_lines(log.limits, f"y{lane + 2}")
         layout["shapes"] += shapes
         layout["annotations"] += labels
     layout["shapes"] += _outages(plan.outages, [arms[a] for a in lanes], unit_s)
@@ -133,54 +111,21 @@ def hottest_motors(logs: Mapping[str, ShiftLog]) -> dict[str, Any]:
     first = next(iter(logs.values()))
     unit, unit_s = time_unit(first.plan.horizon_s)
     traces, values = list[Trace](), list[Array]()
-    for (name, log), (colour, dash) in zip(logs.items(), cycle(POLICY_LINES), strict=False):
+    for number, (name, log) in enumerate(logs.items()):
         temp_c = log.readings.temp_c.reshape(len(log.readings.time_s), -1)  # NaN of an absent arm
         motor = np.nan_to_num(temp_c, nan=-np.inf).argmax(axis=1)
         values.append(temp_c[np.arange(len(motor)), motor])
-        kept = decimate(values[-1], POINTS_PER_TRACE)
+        kept = charts.decimate(values[-1], POINTS_PER_TRACE)
         texts = [plain(f"{log.arms[m // JOINTS]}, joint {m % JOINTS + 1}") for m in motor[kept].tolist()]
         hover = f"{plain(name)}: %{{y:.1f}} °C at %{{x:.1f}} {unit}<br>%{{customdata}}<extra></extra>"
-        line = {"color": colour, "width": 2, "dash": dash}
-        trace = _curve(plain(name, STREAM_NAME), log.readings.time_s[kept] / unit_s, values[-1][kept], line, hover)
-        traces.append(trace | {"customdata": texts})
-    shapes, labels = _limit_lines(first.limits, "y")
-    time = axis(_time_title(first, unit), range=[0, first.plan.horizon_s / unit_s])
-    temperature = axis("hottest motor, °C", range=_range_c(np.concatenate(values), first.limits))
-    return {
-        "data": traces,
-        "layout": LAYOUT
-        | {"height": 360, "margin": MARGIN | {"l": 60, "t": 36}, "showlegend": True, "legend": LEGEND | {"y": 1.02}}
-        | {"modebar": {"orientation": "h"}}
-        | {"xaxis": time, "yaxis": temperature, "shapes": shapes, "annotations": labels},
-    }
-
-
-def _range_c(temp_c: Array, limits: ThermalLimits) -> list[float]:
-    """Range of an axis with these temperatures (NaN of absent arms) and both limits, °C."""
-    low_c = float(np.fmin.reduce(temp_c, axis=None, initial=limits.warning_c - 20.0))
-    high_c = float(np.fmax.reduce(temp_c, axis=None, initial=limits.error_c))
-    room_k = 0.06 * (high_c - low_c)
-    return [low_c - room_k, high_c + room_k]
-
-
-def _curve(name: str, time: Array, value: Array, line: Trace, hover: str) -> Trace:
-    look = {"type": "scatter", "mode": "lines", "name": name, "line": line, "hovertemplate": hover}
-    return look | {"x": _packed(time), "y": _packed(value)}
-
-
-def _limit_lines(limits: ThermalLimits, y: str) -> tuple[list[Trace], list[Trace]]:
-    """Lines of the limits over the whole width of a y axis, and their labels."""
-    lines, labels = list[Trace](), list[Trace]()
-    for name, limit_c, colour, anchor, dash in (
-        ("error", limits.error_c, FAULT, "bottom", "solid"),
-        ("warning", limits.warning_c, WARNING, "top", "longdash"),
-    ):
-        at = {"yref": y, "y0": limit_c, "y1": limit_c, "xref": "paper", "x0": 0, "x1": 1}
-        lines.append(at | {"type": "line", "line": {"color": colour, "width": 1, "dash": dash}})
-        aside = {"x": 1, "xshift": 4, "y": limit_c, "yref": y, "yanchor": anchor, "font": {"size": 10}}
-        label = {"text": f"{name} {limit_c:g} °C", "yshift": -5 if anchor == "bottom" else 5}
-        labels.append(TEXT | aside | label)
-    return lines, labels
+        x, more = log.readings.time_s[kept] / unit_s, {"customdata": texts, "hovertemplate": hover}
+        traces.append(charts.curve(plain(name, STREAM_NAME), x, values[-1][kept], charts.look_of(number), **more))
+    shapes, labels = charts.limit_lines(first.limits)
+    time = charts.axis(_time_title(first, unit), range=[0, first.plan.horizon_s / unit_s])
+    temperature = charts.axis("hottest motor, °C", range=charts.range_c(np.concatenate(values), first.limits))
+    margin = charts.MARGIN | {"r": charts.LIMITS_PX}
+    own = {"margin": margin, "xaxis": time, "yaxis": temperature, "shapes": shapes, "annotations": labels}
+    return {"data": traces, "layout": charts.WITH_LEGEND | own}
 
 
 def _gantt(log: ShiftLog, unit_s: float) -> list[Trace]:
@@ -344,7 +289,7 @@ def _heat_map(log: ShiftLog, lane: int, unit: str, unit_s: float) -> Trace:
             "bdata": base64.b64encode(kelvin.tobytes()).decode(),
             "shape": f"{len(arms)},{len(edges)}",
         },
-        "x": _packed(telemetry.time_s[edges] / unit_s),
+        "x": charts.packed_numbers(telemetry.time_s[edges] / unit_s),
         "y": list(range(len(arms))),
         "xaxis": "x3",
         "yaxis": f"y{lane}",
@@ -467,41 +412,11 @@ def _temperatures(
     traces = []
     for lane, a in enumerate(lanes):
         arm = arms[a]
-        for j, (colour, dash) in enumerate(JOINT_LINES):
+        for j, (colour, dash) in enumerate(charts.JOINT_LINES):
             value, name = telemetry.temp_c[:, a, j], f"joint {j + 1}"
-            kept = decimate(value, points)
             hover = f"{plain(arm)} {name}<br>%{{y:.1f}} °C at %{{x:.2f}} {unit}<extra></extra>"
             line = {"color": colour, "width": 1.5, "dash": dash}
-            place = {"legendgroup": name, "legend": "legend2", "showlegend": lane == 0}
+            place = {"legendgroup": name, "legend": "legend2", "showlegend": lane == 0, "hovertemplate": hover}
             place |= {"xaxis": "x2", "yaxis": f"y{lane + 2}"}
-            traces.append(_curve(name, telemetry.time_s[kept] / unit_s, value[kept], line, hover) | place)
+            traces.append(charts.curve(name, telemetry.time_s / unit_s, value, line, most=points, **place))
     return traces
-
-
-def decimate(value: Array, limit: int) -> Array:
-    """Samples that keep the look of a long line: lowest and highest of each bin, and its gap if it has one.
-
-    Args:
-        value: [sample]; NaN is a gap.
-        limit: Most samples to keep, at least 5.
-
-    Returns:
-        Indices in order, with the first, the last and both extremes among them, int [kept <= limit].
-    """
-    if limit < 5:
-        raise ValueError(f"limit must be >= 5 (got {limit}).")
-    if len(value) <= limit:
-        return np.arange(len(value))
-    gap = np.isnan(value)
-    picks = [np.where(gap, np.inf, value), np.where(gap, np.inf, -value), *([~gap] if gap.any() else [])]
-    edges = np.linspace(0, len(value), (limit - 2) // len(picks) + 1).astype(int)
-    keep = [0, len(value) - 1]
-    for low, high in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        keep += [low + int(pick[low:high].argmin()) for pick in picks]
-    return np.unique(keep)
-
-
-def _packed(values: Array) -> dict[str, str]:
-    """Numbers in Plotly's packed format, a third of the length of decimals."""
-    raw = np.ascontiguousarray(values, dtype="<f4").tobytes()
-    return {"dtype": "f4", "bdata": base64.b64encode(raw).decode("ascii")}
