@@ -14,9 +14,8 @@ import numpy as np
 from fleet.env.render.heat import heat_scale
 from fleet.events import Event
 from scenarios.run.records import JobSpan, Offer, ShiftLog
-from scenarios.show.charts import AXIS, COLOURS, LAYOUT, Figure, named_rows, plain
 from scenarios.show.page import Chart, Page, Playback, packed
-from scenarios.show.timeline import STREAM_NAME, figure, hottest_motors, stream_of, time_unit
+from scenarios.show.timeline import figure, hottest_motors, stream_of, time_unit
 from scenarios.show.words import clock, duration, kind_text, names_text, offer_text, value_text
 from scenarios.table import Column, Moment, Table, render
 
@@ -366,17 +365,6 @@ MOST_ARMS = 8
 """With more arms, the columns of an award are the best other offers instead of the arms."""
 
 
-@dataclass(frozen=True)
-class Tile:
-    """A key figure."""
-
-    label: str
-    number: str
-    small: str
-    """Unit, whole or arm beside the number."""
-    bad: bool
-
-
 def report_html(log: ShiftLog, model: Mapping[str, Any] | None = None) -> str:
     """The report of a shift as one HTML page; the same input, with events in any order, gives the same text.
 
@@ -468,26 +456,20 @@ KEY_FIGURES = (
     KeyFigure("insulation used", "most_insulation_ppb", ",.3g", "ppb"),
     KeyFigure("claims lost to another arm", "lost_claims", ",.0f"),
 )
-MAIN_FIGURES = tuple(
-    each
-    for each in KEY_FIGURES
-    if each.name in ("finished", "value", "on_time", "faults", "above_warning_min", "hottest_c")
-)
-"""Those by which shifts are compared."""
 RARE = ("contacts", "given_up", "expired")
 """At the head of a report only where there are some."""
 
 
-def key_figures(metrics: Mapping[str, Any]) -> list[Tile]:
-    """The most important metrics; those without a number are left out."""
-    values, peaks = numbers(metrics), _peaks(metrics)
-    hottest = max(peaks, key=lambda arm: peaks[arm], default="")
-    tiles: list[Tile] = []
+def key_figures(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Name, text and style of the most important metrics; those without a number are left out."""
+    values, peaks_c = numbers(metrics), _peaks(metrics)
+    hottest = max(peaks_c, key=lambda arm: peaks_c[arm], default="")
+    tiles = list[tuple[str, str, str]]()
     for label, name, form, unit, whole in KEY_FIGURES:
         if name in values and (name not in RARE or values[name] > 0):
-            small = f" of {values[whole]:{form}}" if whole in values else f" {unit} {hottest * (name == 'hottest_c')}"
-            bad = name in ("faults", "contacts") and values[name] > 0
-            tiles.append(Tile(label, f"{values[name]:{form}}", small.rstrip(), bad))
+            small = f"of {values[whole]:{form}}" if whole in values else f"{unit} {hottest * (name == 'hottest_c')}"
+            bad = "bad" if name in ("faults", "contacts") and values[name] > 0 else ""
+            tiles.append((label, f"{values[name]:{form}} {small}".rstrip(), bad))
     return tiles
 
 
@@ -636,10 +618,6 @@ def other_choices(log: ShiftLog, other: ShiftLog) -> list[str]:
     return lines
 
 
-BAR_PX, TITLE_PX = 24, 44
-"""Height of a bar, and of the title and the gap above the bars of a figure."""
-
-
 def runs_table(logs: Mapping[str, ShiftLog]) -> Table:
     """Settings, outcome and key figures, a column for each run by its name; "" for a figure that a run lacks."""
     settings = {
@@ -682,7 +660,6 @@ def runs_page(
             alt = f"Hottest motor over the shift under {', '.join(logs)}"
             charts.append(Chart(key="hottest", figure=hottest_motors(logs), alt=alt))
         replay = _playback([*logs.values()], model) if model else None
-    main = Chart(key="main", figure=bars(logs), alt=f"Main figures of {', '.join(logs)}; the table has them")
     hashes = ("code_hash", "scenario_hash")
     content = {
         "sentences": lead or (f"The runs differ in {', '.join(differ) or 'nothing'}. {jobs}",),
@@ -700,7 +677,6 @@ def runs_page(
         ],
         "charts": charts,
         "replays": tuple(logs) if replay else (),
-        "main": main,
         "table": table,
         "origin": Table(
             head=("run", "hash of the code", "hash of the scenario"),
@@ -709,42 +685,4 @@ def runs_page(
         ),
     }
     title = title or f"{len(logs)} runs{'' if 'scenario' in differ else f' of {table.rows[0][1]}'}"
-    return Page(title=title, template="runs.html", content=content, charts=[*charts, main], replay=replay).html()
-
-
-def bars(logs: Mapping[str, ShiftLog]) -> Figure:
-    """The main figures one below the other, each with a bar for each run."""
-    values = [numbers(log.card.get("metrics") or {}) for log in logs.values()]
-    shown = [each for each in MAIN_FIGURES if any(each.name in own for own in values)]
-    block_px = TITLE_PX + BAR_PX * len(logs)
-    height_px = block_px * max(1, len(shown))
-    names = [plain(name, STREAM_NAME) for name in logs]
-    data, layout, titles = list[dict[str, Any]](), dict[str, Any](), list[dict[str, Any]]()
-    for number, (label, name, form, unit, _) in enumerate(shown, start=1):
-        top = 1 - ((number - 1) * block_px + TITLE_PX) / height_px
-        own = [each.get(name) for each in values]
-        text = [f"{value:{form}}" if value is not None else "" for value in own]
-        axes = {"xaxis": f"x{number}", "yaxis": f"y{number}"}
-        look = {"color": [COLOURS[k % len(COLOURS)] for k in range(len(names))]}
-        data.append(
-            {"type": "bar", "orientation": "h", "x": own, "y": list(range(len(own))), "text": text, "marker": look}
-            | {
-                "hovertemplate": "%{text}<extra></extra>",
-                "textposition": "outside",
-                "textangle": 0,
-                "cliponaxis": False,
-                **axes,
-            }
-        )
-        layout[f"xaxis{number}"] = AXIS | {"anchor": f"y{number}", "rangemode": "tozero", "visible": False}
-        domain = [max(0.0, top - BAR_PX * len(logs) / height_px), top]
-        layout[f"yaxis{number}"] = named_rows(names, anchor=f"x{number}", domain=domain)
-        place = {"x": 0, "xref": "paper", "xanchor": "left", "y": top, "yref": "paper", "yanchor": "bottom"}
-        titles.append({"text": f"<b>{Column(label, unit)}</b>", "showarrow": False, **place})
-    margin = {"l": 60, "r": 48, "t": 4, "b": 12}
-    return {
-        "data": data,
-        "layout": LAYOUT
-        | layout
-        | {"height": height_px + 16, "margin": margin, "annotations": titles, "showlegend": False},
-    }
+    return Page(title=title, template="runs.html", content=content, charts=charts, replay=replay).html()
