@@ -1,11 +1,10 @@
-"""Sources of predictions by name, from the trained twin to random numbers, and the prepared fleets of a study.
+"""Sources of predictions by name, and the prepared fleets of a study.
 
 A source gives the arms of a fleet their difficulty models: difficulty, P(saturation) and predicted peak. Those besides
 `twin` and `oracle` do not mix two methods: d and P of a VAE come from its reconstruction errors alone, and only thermal
 networks predict peak temperatures.
 """
 
-import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -15,10 +14,9 @@ from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
-from fleet.difficulty import Difficulty, DifficultyModel, difficulty_of_error, heat_weights
+from fleet.difficulty import Difficulty, DifficultyModel, difficulty_of_error
 from fleet.errors import FleetError, nearest
 from fleet.motion import Plan
-from fleet.robot import JOINTS
 from scenarios.extras import require_extra
 from scenarios.prepare.arms import PlannedArm, plan_arms
 from scenarios.prepare.fleet import Fleet, prepare, with_surprises
@@ -162,82 +160,43 @@ class Learned:
 
 
 @dataclass(frozen=True)
-class _Changed:
-    """The predictions of a model, changed."""
+class _Unweighted:
+    """The predictions of a model with d = Σ_k d_k, as in the paper."""
 
     model: DifficultyModel
-    version: str
-    change: Callable[[Difficulty], Difficulty]
+
+    @property
+    def version(self) -> str:
+        return f"{self.model.version}, unweighted"
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
         score = self.model.score(plan, repetitions)
-        return score and self.change(score)
-
-
-def unweighted(model: DifficultyModel) -> _Changed:
-    """The predictions of a model with d = Σ_k d_k, as in the paper."""
-    return _Changed(model, f"{model.version}, unweighted", lambda score: replace(score, weight=None))
-
-
-def inverted(model: DifficultyModel) -> _Changed:
-    """The opposite of a model: d_k and P of hard work are those of easy work."""
-
-    def opposite(score: Difficulty) -> Difficulty:
-        assert score.risk is None or score.risk.offset.shape[-1] == 1, "the opposite of a maximum is not one"
-        risk = score.risk and replace(score.risk, offset=-score.risk.offset, weight=-score.risk.weight)
-        return Difficulty(np.minimum(1.0 - score.per_joint, BELOW_ONE), risk=risk, weight=score.weight)
-
-    return _Changed(model, f"inverted {model.version}", opposite)
+        return score and replace(score, weight=None)
 
 
 @dataclass(frozen=True)
 class _Torque:
-    """d_k from the RMS torque over that of the training motion; P from a regression on the mean squared torque."""
+    """d_k from the RMS torque over that of the training motion, d their sum; P from a regression on squared torque."""
 
     known_nm: Array
     """RMS torque of the training motion, [joint]."""
     risk: DifficultyModel
-    version: str = "torque"
+    version: str = "torque, unweighted"
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
         from twin.baselines import torque_ratio
 
         per_joint = difficulty_of_error(torque_ratio(plan, repetitions, self.known_nm))
         score = self.risk.score(plan, repetitions)
-        weight = heat_weights(self.known_nm**2)
-        return Difficulty(np.minimum(per_joint, BELOW_ONE), risk=score and score.risk, weight=weight)
-
-
-@dataclass(frozen=True)
-class _Random:
-    """Uniform d_k and P for each plan and number of repetitions, the same whenever they are asked for."""
-
-    seed: int
-    version: str = "random"
-
-    def score(self, plan: Plan, repetitions: int) -> Difficulty:
-        motion = hashlib.sha256(np.ascontiguousarray(plan.cycle.profile).tobytes()).digest()
-        entropy = [self.seed, repetitions, int.from_bytes(motion[:8], "little"), *plan.arm.encode()]
-        drawn = np.random.default_rng(np.random.SeedSequence(entropy)).random(JOINTS + 1)
-        return Difficulty(drawn[:JOINTS], p_saturation=float(drawn[JOINTS]))
-
-
-@dataclass(frozen=True)
-class _Constant:
-    """The same score for everything."""
-
-    version: str = "constant"
-
-    def score(self, plan: Plan, repetitions: int) -> Difficulty:
-        return Difficulty(np.full(JOINTS, 0.5), p_saturation=0.5)
+        return Difficulty(np.minimum(per_joint, BELOW_ONE), risk=score and score.risk)
 
 
 def _vae(planned: PlannedFleet, training: int, *, trained: bool = True, thermometers: bool = True) -> Fleet:
     return planned.scored(planned.learned(training, "excess", trained=trained, thermometers=thermometers))
 
 
-def _changed(planned: PlannedFleet, fleet: Fleet, change: Callable[[DifficultyModel], _Changed]) -> Fleet:
-    return planned.scored([change(arm.model) for arm in fleet.arms])
+def _unweighted(planned: PlannedFleet, fleet: Fleet) -> Fleet:
+    return planned.scored([_Unweighted(arm.model) for arm in fleet.arms])
 
 
 def _torque(planned: PlannedFleet, *, thermometers: bool = True) -> Fleet:
@@ -265,33 +224,25 @@ def _network(planned: PlannedFleet, risk: RiskName) -> Fleet:
     return replace(fleet, arms=tuple(arms))
 
 
-def _random(planned: PlannedFleet, training: int) -> Fleet:
-    from scenarios.prepare.twins import training_seed
-
-    return planned.scored([_Random(training_seed(planned.scenario, training))] * len(planned.arms))
-
-
 SOURCES: dict[str, Callable[[PlannedFleet, int], Fleet]] = {
     # d and P of the VAE alone; `twin` has P and peak of the identified thermal network besides.
     "trained": _vae,
     "untrained": partial(_vae, trained=False),
-    "unweighted": lambda planned, training: _changed(planned, _vae(planned, training), unweighted),
+    "unweighted": lambda planned, training: planned.scored(
+        [_Unweighted(arm.model) for arm in _vae(planned, training).arms]
+    ),
     # The same without thermometers: the paper's case.
     "trained-alone": partial(_vae, thermometers=False),
     "untrained-alone": partial(_vae, trained=False, thermometers=False),
-    "torque-alone": lambda planned, _: _changed(planned, _torque(planned, thermometers=False), unweighted),
+    "torque-alone": lambda planned, _: _torque(planned, thermometers=False),
     # RMS torque over that of the training motion.
-    "torque": lambda planned, _: _changed(planned, _torque(planned), unweighted),
-    "weighted-torque": lambda planned, _: _torque(planned),
+    "torque": lambda planned, _: _torque(planned),
     # Thermal networks alone: of a nominal arm, and as identified.
     "rc-nominal": lambda planned, _: _network(planned, "rc-nominal"),
     "rc": lambda planned, _: _network(planned, "rc"),
-    "random": _random,
-    "inverted": lambda planned, training: _changed(planned, _vae(planned, training), inverted),
-    "constant": lambda planned, _: planned.scored([_Constant()] * len(planned.arms)),
 }
 """The fleet with the predictions of each source besides `PREPARED`, from its plans and the training, from 0."""
-UNTRAINED = ("torque", "torque-alone", "weighted-torque", "rc-nominal", "rc", "constant")
+UNTRAINED = ("torque", "torque-alone", "rc-nominal", "rc")
 """Sources that do not depend on the training: one stands for all."""
 ALL_SOURCES = (*PREPARED, *SOURCES)
 """Names, as `--difficulty` of `thermofleet compare` takes them."""
