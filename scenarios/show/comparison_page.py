@@ -15,7 +15,7 @@ from scenarios.evaluate.statistics import LEGEND, LEVEL, Interval, profile
 from scenarios.policy_loader import is_on_bus, label
 from scenarios.show import charts
 from scenarios.show.charts import COLOURS, LAYOUT, MARGIN, SYMBOLS, Figure, Trace, axis, plain
-from scenarios.show.page import Chart, Page
+from scenarios.show.page import Chart, Section, sections_page
 from scenarios.show.words import value_text
 from scenarios.table import Column, Table
 
@@ -132,27 +132,52 @@ class Judged:
 
 def comparison_page(judged: Judged) -> str:
     """The page; the same input gives the same text."""
-    scored = judged.scores is not None
-    charts = [*(_score_charts(judged) if scored else []), *_heat_charts(judged)]
+    return sections_page(judged.title, [*_sections(judged)], _origin(judged), verdict(judged))
+
+
+def _sections(judged: Judged) -> Iterator[Section]:
+    base, scores = label(judged.baseline), judged.scores
+    if scores:
+        means, profiles = _score_charts(judged)
+        how = (
+            f"difference: paired, to {base}; {LEGEND}. IQM: mean of the middle half. better in: share of instances "
+            "with a better score than the baseline. heat binds, it does not: mean scores in instances in which a "
+            "policy that ignores heat is expected to fault, and in the others."
+        )
+        tables, remarks = (score_table(scores),), tuple(scores.remarks)
+        own = {"sentences": remarks, "charts": (means,), "tables": tables, "how": how}
+        yield Section(key="score", title="Normalised score", **own)
+        how = (
+            "Share of instances with a score above each threshold; bands: pointwise 95 % intervals of the best and of "
+            f"{base}."
+        )
+        yield Section(key="profile", title="Performance profiles", charts=(profiles,), how=how)
+    if cells := _cell_table(judged):
+        how = "Mean normalised score; ● best of the column; number of instances in brackets."
+        yield Section(key="cells", title="By cell or scenario", tables=(cells,), how=how)
+    for number, result in enumerate(judged.results):
+        where = f": {result.scenario}" if len(judged.results) > 1 else ""
+        if chart := _heat_chart(result, number):
+            yield Section(key=f"heat-{number}", title=f"Value against heat{where}", charts=(chart,))
+        key, title = f"figures-{number}", f"All figures{where}"
+        if not result.figures:
+            yield Section(key=key, title=title, failed=f"the baseline {label(result.baseline)} failed.")
+            continue
+        about = f"{result.scenario}, {result.unit}. Mean and paired difference to {label(result.baseline)}; {LEGEND}."
+        settings = f"Channel: {result.channel_text}. Randomisation: {result.randomise.text}."
+        scope, *groups = result.table.split()
+        sentences = (f"{about} {settings}", *result.table.notes)
+        yield Section(key=key, title=title, sentences=sentences, details=(*groups, scope))
     failures = [each for result in judged.results for each in result.failures]
-    content = {
-        "verdict": verdict(judged),
-        "scores": score_table(judged.scores) if judged.scores else None,
-        "remarks": judged.scores.remarks if judged.scores else (),
-        "baseline": label(judged.baseline),
-        "legend": LEGEND,
-        "by_cell": _cell_table(judged),
-        "charts": {chart.key: chart for chart in charts},
-        "figures": [_figures(result) for result in judged.results],
-        "several": len(judged.results) > 1,
-        "failures": [(_failure_text(each), each.trace) for each in failures[:MOST_FAILURES]],
-        "more_failures": max(0, len(failures) - MOST_FAILURES),
-        "illegal": _illegal(judged.results) or "No illegal action.",
-        "command": judged.command,
-        "card": _card_table(judged.card),
-        "hashes": Table(head=("", ""), rows=tuple(judged.card["instances"].items()), numbers=False),
-    }
-    return Page(title=judged.title, template="comparison.html", content=content, charts=charts, narrow=True).html()
+    sentences = [_illegal(judged.results) or "No illegal action.", *(["No policy failed."] if not failures else [])]
+    if len(failures) > MOST_FAILURES:
+        sentences.append(f"{len(failures) - MOST_FAILURES} more are in results.parquet.")
+    traces = tuple((_failure_text(each), each.trace) for each in failures[:MOST_FAILURES])
+    yield Section(key="failures", title="Failures and illegal actions", sentences=tuple(sentences), details=traces)
+    hashes = [f"{digest}  {name}" for name, digest in judged.card["instances"].items()]
+    about = "Every shift is a row of results.parquet beside this page; study.json has these hashes."
+    details = ((f"Hashes of {len(hashes)} scenarios", "\n".join(hashes)),)
+    yield Section(key="rows", title="How to repeat", sentences=(judged.command, about), details=details)
 
 
 def verdict(judged: Judged) -> list[str]:
@@ -265,29 +290,13 @@ def _cell_table(judged: Judged) -> Table | None:
     return Table(head=head, rows=rows)
 
 
-def _heat_charts(judged: Judged) -> Iterator[Chart]:
-    """Value against heat, one chart for each result."""
-    for number, result in enumerate(judged.results):
-        figures = {label(name): (each["peak_c"], each["value"]) for name, each in result.figures.items()}
-        rows = [(name, (x.mean, x.low, x.high), (y.mean, y.low, y.high)) for name, (x, y) in figures.items()]
-        if rows:
-            drawn = points(rows, "hottest motor, °C, mean over shifts", "value of finished jobs, mean over shifts")
-            alt = f"value of finished jobs against the hottest motor of {', '.join(figures)}"
-            yield Chart(key=f"heat_{number}", figure=drawn, alt=alt)
-
-
-def _figures(result: Comparison) -> dict[str, object]:
-    """Every figure of every policy, with the difference to the baseline, the best reward first."""
-    about = f"{result.scenario}, {result.unit}. Mean and paired difference to {label(result.baseline)}"
-    settings = f"Channel: {result.channel_text}. Randomisation: {result.randomise.text}."
-    table = result.table
-    return {
-        "scenario": result.scenario,
-        "baseline": label(result.baseline),
-        "about": f"{about}; {LEGEND}. {settings}",
-        "groups": list(table.split()) if result.figures else [],
-        "notes": table.notes,
-    }
+def _heat_chart(result: Comparison, number: int) -> Chart | None:
+    """Value against heat; None without figures."""
+    figures = {label(name): (each["peak_c"], each["value"]) for name, each in result.figures.items()}
+    rows = [(name, (x.mean, x.low, x.high), (y.mean, y.low, y.high)) for name, (x, y) in figures.items()]
+    drawn = points(rows, "hottest motor, °C, mean over shifts", "value of finished jobs, mean over shifts")
+    alt = f"value of finished jobs against the hottest motor of {', '.join(figures)}"
+    return Chart(key=f"heat_{number}", figure=drawn, alt=alt) if rows else None
 
 
 def _failure_text(each: Failed) -> str:
@@ -295,8 +304,9 @@ def _failure_text(each: Failed) -> str:
     return f"{where}: {each.error}"
 
 
-def _card_table(card: Mapping[str, Any]) -> Table:
+def _origin(judged: Judged) -> Table:
     """Code, versions, settings and policies of a study."""
+    card = judged.card
     rows = [("code", str(card["code_hash"])), *((f"version of {k}", str(v)) for k, v in card["versions"].items())]
     rows += [(name, value_text(card[name])) for name in ("risk", "channel", "randomise", "decision_limit_s")]
     for name, digest in card["policies"].items():

@@ -2,15 +2,13 @@
 
 import base64
 import gzip
-import io
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from importlib.util import find_spec
-from itertools import chain
 from pathlib import Path
 from typing import Any  # values of JSON
 from zipfile import ZipFile
@@ -60,6 +58,8 @@ class Section:
     """Method."""
     charts: tuple[Chart, ...] = ()
     tables: tuple[Table, ...] = ()
+    details: tuple[tuple[str, Table | str], ...] = ()
+    """Headings, and what a click on each shows: a table, or text as it is."""
     numbers: Mapping[str, Any] = field(default_factory=dict)  # plain values for report.json
     failed: str | None = None
     """Why there is no result; None for a complete section."""
@@ -155,12 +155,12 @@ def sections_page(
 def _plotly_js() -> str:
     from plotly.offline import get_plotlyjs
 
-    return compressed([get_plotlyjs().encode()])
+    return compressed(get_plotlyjs().encode())
 
 
 @cache
 def _packed_three_js() -> str:
-    return compressed([three_js().encode()])
+    return compressed(three_js().encode())
 
 
 def _json(value: object) -> str:
@@ -216,35 +216,26 @@ def packed(telemetry: Telemetry, payload_kg: Array | None = None) -> str:
         for name, values, scale, stride in arrays
     ]
 
-    def body() -> Iterator[bytes]:
-        for _, values, scale, stride in arrays:
-            for arm in range(arms):  # one at a time, as large fleets have much
-                steps = np.clip(np.round(_filled(values[::stride, arm]) / scale), -(2**15), 2**15 - 1)
-                yield np.diff(steps.astype(np.int32).T, axis=-1, prepend=0).astype("<i2").tobytes()
+    parts = [json.dumps(listed, separators=(",", ":")).encode() + b"\n"]
+    for _, values, scale, stride in arrays:
+        for arm in range(arms):  # one at a time, as large fleets have much
+            steps = np.clip(np.round(_filled(values[::stride, arm]) / scale), -(2**15), 2**15 - 1)
+            parts.append(np.diff(steps.astype(np.int32).T, axis=-1, prepend=0).astype("<i2").tobytes())
+    return compressed(b"".join(parts))
 
-    return compressed(chain([json.dumps(listed, separators=(",", ":")).encode() + b"\n"], body()))
 
-
-def compressed(content: Iterable[bytes]) -> str:
-    """Bytes, in pieces, as base64 of a gzip stream; the same content gives the same text."""
-    packed = io.BytesIO()
-    with gzip.GzipFile(fileobj=packed, mode="wb", compresslevel=9, mtime=0) as file:
-        for piece in content:
-            file.write(piece)
-    return base64.b64encode(packed.getbuffer()).decode("ascii")
+def compressed(content: bytes) -> str:
+    """Bytes as base64 of a gzip stream; the same content gives the same text."""
+    return base64.b64encode(gzip.compress(content, 9, mtime=0)).decode("ascii")
 
 
 def _filled(values: Array) -> Array:
     """Values along the first axis, NaN replaced by the last value before it, or the first after it."""
-    values = np.array(values, dtype=float)
-    if np.isfinite(values).all():
-        return values
-    flat = values.reshape(len(values), -1)
-    for column in flat.T:
-        known = np.flatnonzero(np.isfinite(column))
-        last = np.searchsorted(known, np.arange(len(column)), side="right") - 1
-        column[:] = column[known[np.maximum(last, 0)]] if len(known) else 0.0
-    return flat.reshape(values.shape)
+    known = np.isfinite(values)
+    at = np.arange(len(values)).reshape(-1, *[1] * (values.ndim - 1))
+    last = np.maximum.accumulate(np.where(known, at, 0))
+    last = np.where(np.logical_or.accumulate(known), last, known.argmax(axis=0))
+    return np.nan_to_num(np.take_along_axis(values, last, axis=0))
 
 
 def three_js() -> str:

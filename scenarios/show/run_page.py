@@ -16,7 +16,7 @@ from fleet.events import Event
 from scenarios.run.records import JobSpan, Offer, ShiftLog
 from scenarios.show.page import Chart, Page, Playback, packed
 from scenarios.show.timeline import figure, hottest_motors, stream_of, time_unit
-from scenarios.show.words import clock, duration, kind_text, names_text, offer_text, value_text
+from scenarios.show.words import clock, duration, kind_text, names_text, offer_text, offers_text, value_text
 from scenarios.table import Column, Moment, Table, render
 
 MOST_FAULTS = 2
@@ -361,8 +361,8 @@ NOTABLE = (
 )
 """Event kinds of the event table, most important first; the least important are dropped first."""
 MOST_AWARDS = 300
-MOST_ARMS = 8
-"""With more arms, the columns of an award are the best other offers instead of the arms."""
+MOST_OFFERS = 7
+"""Other offers that an award shows."""
 
 
 def report_html(log: ShiftLog, model: Mapping[str, Any] | None = None) -> str:
@@ -546,26 +546,17 @@ def _before(event: Event) -> Moment:
 
 def _award_table(log: ShiftLog) -> Mapping[str, object] | None:
     """Why each arm got its job: the offers behind each award, side by side; None without offers."""
-    arms = log.arms
     awards = [list(group) for _, group in groupby(log.offers, key=lambda o: (o.time_s, o.job))]
     if not awards:
         return None
-    every_arm = len(arms) <= MOST_ARMS
-    head = ("time", "job", "awarded to", *(arms if every_arm else ("its offer", "best other offers", "", "")))
     rows, moments = list[tuple[str, ...]](), list[Moment]()
     for award in awards[:MOST_AWARDS]:
         winner = next(offer for offer in award if offer.awarded)
-        if every_arm:
-            of = {offer.arm: offer for offer in award}
-            cells = [offer_text(of[arm]) if arm in of else "" for arm in arms]
-        else:
-            others = sorted(
-                (o for o in award if o.free and not o.awarded), key=lambda o: (o.p_saturation or 0.0, o.arm)
-            )
-            cells = [offer_text(winner), *(f"{o.arm}: {offer_text(o)}" for o in others[:3])]
-            cells += [""] * (4 - len(cells))
-        rows.append((clock(winner.time_s, log.begin), winner.job, winner.arm, *cells))
+        others = sorted((o for o in award if o is not winner), key=lambda o: (not o.free, o.p_saturation or 0.0, o.arm))
+        cells = (winner.arm, offer_text(winner), offers_text(others[:MOST_OFFERS]))
+        rows.append((clock(winner.time_s, log.begin), winner.job, *cells))
         moments.append(Moment(winner.time_s, winner.arm))
+    head = ("time", "job", "awarded to", "its offer", "other offers, the best first")
     table = Table(head=head, rows=tuple(rows), numbers=False)
     left = f" The first {MOST_AWARDS} of {len(awards)} are listed; offers.parquet has all of them."
     return {

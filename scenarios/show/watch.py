@@ -162,13 +162,13 @@ def follow(frames: Iterator[FleetSnapshot], news: deque[str], *, joints: bool, e
 def describe(name: str, message: msgspec.Struct) -> str:
     """Line about an event or a result; "" for other messages."""
     if isinstance(message, ArmEvent):
-        return f"{format_time(message.time_s)}  {name} {event_text(message)}"
+        return f"{clock(message.time_s)}  {name} {event_text(message)}"
     if isinstance(message, Result):
-        return f"{format_time(message.time_s)}  job {describe_status(message.status)}"
+        return f"{clock(message.time_s)}  job {describe_status(message.status)}"
     if isinstance(message, Alarm):
         seen = f"{message.by} has seen the alarm" if message.by else ""
         change = "alarm has ended" if message.ended_s is not None else seen or "alarm"
-        return f"{format_time(message.time_s)}  {change}: {message.what}"
+        return f"{clock(message.time_s)}  {change}: {message.what}"
     return ""
 
 
@@ -221,11 +221,11 @@ def time_line(fleet: FleetSnapshot, end_s: float | None = None) -> Text:
     if now_s is None:
         return _line("no time yet")
     if end_s is None:
-        return _line(format_time(now_s))
+        return _line(clock(now_s))
     left_s, so_far = max(0.0, end_s - now_s), bar(now_s / end_s, 2 * HEAT_CELLS)
     speed = fleet.speed or 1.0
     real = f" ({brief(left_s / speed)} at {speed:g} ×)" if speed != 1.0 else ""
-    return _line(f"{so_far} {format_time(now_s)} of {format_time(end_s)}, {format_time(left_s)} left{real}")
+    return _line(f"{so_far} {clock(now_s)} of {clock(end_s)}, {clock(left_s)} left{real}")
 
 
 def arm_table(arms: Iterable[ArmSnapshot], *, wide: bool = False) -> Table:
@@ -354,11 +354,6 @@ def format_age(seconds: float | None) -> str:
     if seconds < 10:
         return f"{max(0.0, seconds):.1f} s"
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
-
-
-def format_time(time_s: float) -> str:
-    """Fleet time: `1:02:03`."""
-    return clock(int(time_s))
 
 
 def _headroom_style(headroom_k: float | None) -> str:

@@ -1,6 +1,6 @@
 """Times, events and offers in words."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from typing import TYPE_CHECKING
 
@@ -78,3 +78,8 @@ def offer_text(offer: "Offer") -> str:
     parts.append(f"{(offer.duration_s or 0.0) / 60:.0f} min")
     barred = "" if offer.free else f" ({offer.state if offer.state != 'idle' else 'place or space taken'})"
     return ", ".join(parts) + barred
+
+
+def offers_text(offers: "Iterable[Offer]") -> str:
+    """Offers of several arms in one sentence."""
+    return "; ".join(f"{offer.arm}: {offer_text(offer)}" for offer in offers)
