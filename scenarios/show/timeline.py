@@ -8,13 +8,12 @@ from typing import Any, TypeVar  # Any: values of Plotly's schema
 import numpy as np
 
 from fleet.env.render.heat import HEAT, heat_marks
-from fleet.events import Event
 from fleet.robot import JOINTS
 from fleet.telemetry import Telemetry
 from scenarios.run.records import JobSpan, Outage, ShiftLog
 from scenarios.show import charts
 from scenarios.show.charts import AXIS, FAULT, INK, LAYOUT, WARNING, Trace, plain
-from scenarios.show.words import clock, duration
+from scenarios.show.words import clock, duration, event_text
 
 Array = np.ndarray
 Span = TypeVar("Span", JobSpan, Outage)
@@ -42,9 +41,8 @@ HEAT_BINS = 1440
 """Columns of the heat map."""
 
 MARGIN = {"l": 90, "r": charts.LIMITS_PX, "b": 52}
-NARROW_PX = 860
-"""Width of the plotting area on a small laptop; a legend wraps at this width."""
-LEGEND_ROW_PX = 20.0
+TOP_PX = 64.0
+"""Room for the upper legend on one line; the page makes more where it has several."""
 NAME_PX = 20.0
 """Height of the name of an arm above its lane."""
 MAP_GAP_PX, MAP_ROW_PX = 90.0, 8.0
@@ -76,16 +74,11 @@ def figure(log: ShiftLog) -> dict[str, Any]:
         "title": {"text": _time_title(log, unit), "standoff": 6},
         "domain": [0, 1],
     }
-    layout = SHIFT_LAYOUT | _blocks(arms, lanes, _legend_height(bars))
+    layout = SHIFT_LAYOUT | _blocks(arms, lanes)
     layout["xaxis"] = time | {"anchor": "y"}
     layout["xaxis2"] = time | {"anchor": f"y{len(lanes) + 1}", "matches": "x"}
-    title = {"text": "°C", "standoff": 8}
-    temperature = AXIS | {
-        "range": charts.range_c(telemetry.temp_c, log.limits),
-        "title": title,
-        "anchor": "x2",
-        "nticks": 6,
-    }
+    shown_c = charts.range_c(telemetry.temp_c, log.limits)
+    temperature = charts.axis("°C", range=shown_c, anchor="x2", nticks=6)
     layout["shapes"] = []
     for lane in range(len(lanes)):
         key = f"yaxis{lane + 2}"
@@ -152,7 +145,13 @@ def _gantt(log: ShiftLog, unit_s: float) -> list[Trace]:
                 "y": [arms.index(e.arm) - 0.42 for e in marked],
             }
             trace = {"type": "scatter", "mode": "markers", "name": kind, "marker": look, "legend": "legend"}
-            traces.append(trace | at | _hover([_event_text(e, log.begin) for e in marked]))
+            traces.append(
+                trace
+                | at
+                | _hover(
+                    [f"<b>{plain(e.arm)}</b> at {clock(e.time_s, log.begin)}<br>{plain(event_text(e))}" for e in marked]
+                )
+            )
     return traces
 
 
@@ -255,12 +254,6 @@ def _outage_text(o: Outage, begin: datetime | None) -> str:
     )
 
 
-def _event_text(e: Event, begin: datetime | None) -> str:
-    """Hover text of one event."""
-    job = f"<br>{plain(e.job)}" if e.job else ""
-    return f"<b>{e.kind}</b> of {plain(e.arm)} at {clock(e.time_s, begin)}<br>{plain(e.reason)}{job}"
-
-
 def _lanes(telemetry: Telemetry, arms: int) -> list[int]:
     """Indices of the arms with a lane of temperatures: all of a small fleet, the hottest of a large one."""
     if arms <= MOST_LANES:
@@ -321,57 +314,47 @@ def _time_title(log: ShiftLog, unit: str) -> str:
     return f"time ({unit})" if log.begin is None else f"time since {log.begin:%a %d %b %H:%M} ({unit})"
 
 
-def _blocks(arms: Sequence[str], lanes: Sequence[int], legend_px: float) -> dict[str, Any]:
+def _blocks(arms: Sequence[str], lanes: Sequence[int]) -> dict[str, Any]:
     """Heights, titles and legends of the Gantt chart, of the heat map of a large fleet, and of the lanes."""
     overview = len(lanes) < len(arms)
     gantt_px = max(90.0, len(arms) * (40.0 if len(arms) <= 8 else 26.0 if not overview else 12.0))
     lane_px = 120.0 if len(lanes) <= 8 else 84.0
-    map_px = len(arms) * MAP_ROW_PX if overview else 0.0
-    map_top = gantt_px + MAP_GAP_PX
-    first = map_top + map_px if overview else gantt_px
-    tops = [first + GAP_PX + a * (lane_px + BETWEEN_LANES_PX) for a in range(len(lanes))]
-    total_px = tops[-1] + lane_px
+    heat_maps = [(MAP_GAP_PX, len(arms) * MAP_ROW_PX)] * overview
+    gaps_px, heights_px = np.array(
+        [(0.0, gantt_px), *heat_maps, (GAP_PX, lane_px), *[(BETWEEN_LANES_PX, lane_px)] * (len(lanes) - 1)]
+    ).T
+    ends_px = np.cumsum(gaps_px + heights_px)
+    total_px = float(ends_px[-1])
+    tops = (1.0 - (ends_px - heights_px) / total_px).tolist()  # in Plotly's coordinate: 1 at the top, 0 at the bottom
+    domains = [[max(0.0, end), top] for end, top in zip((1.0 - ends_px / total_px).tolist(), tops, strict=True)]
+    first = 1 + overview
 
-    def paper(from_top_px: float) -> float:
-        """Plotly's coordinate: 1 at the top, 0 at the bottom."""
-        return 1.0 - from_top_px / total_px
-
-    def title(text: str, from_top_px: float, size: int = 15) -> dict[str, Any]:
-        place = {"x": 0, "y": paper(from_top_px), "yref": "paper", "yanchor": "bottom"}
+    def title(text: str, top: float, above_px: float, size: int = 15) -> dict[str, Any]:
+        place = {"x": 0, "y": top + above_px / total_px, "yref": "paper", "yanchor": "bottom"}
         return TEXT | place | {"text": f"<b>{text}</b>", "font": {"size": size}}
 
-    rows: dict[str, Any] = {
-        "domain": [paper(gantt_px), 1.0],
-        "range": [len(arms) - 0.4, -0.65],
-        "tickvals": list(range(len(arms))),
-        "ticktext": [plain(arm, ARM_NAME) for arm in arms],
-        "showgrid": False,
-        "fixedrange": True,
-        "automargin": True,
-    }
+    names = [plain(arm, ARM_NAME) for arm in arms]
+    rows = charts.named_rows(names, domain=domains[0], range=[len(arms) - 0.4, -0.65], fixedrange=True)
     heat: Trace = {}
     if overview:
         rows["tickfont"] = {"size": 8}
-        place = {"domain": [paper(map_top + map_px), paper(map_top)], "anchor": "x3", "range": [len(arms) - 0.5, -0.5]}
-        every = slice(None, None, -(-len(arms) // 50))
-        marks = {name: rows[name][every] for name in ("tickvals", "ticktext")}
-        heat = {f"yaxis{len(lanes) + 2}": AXIS | rows | place | marks}
+        every = -(-len(arms) // 50)
+        marks = {name: rows[name][::every] for name in ("tickvals", "ticktext")}
+        place = {"domain": domains[1], "anchor": "x3", "range": [len(arms) - 0.5, -0.5]}
+        heat = {f"yaxis{len(lanes) + 2}": rows | place | marks}
+    temperatures = _heading(f"Motor temperatures{' of the hottest arms' if overview else ''}")
+    above = tops[first] + (NAME_PX + 6.0) / total_px
     return {
-        "height": round(total_px + legend_px + 44.0 + MARGIN["b"]),
-        "margin": MARGIN | {"t": round(legend_px + 44.0)},
-        "yaxis": AXIS | rows,
+        "height": round(total_px + TOP_PX + MARGIN["b"]),
+        "margin": MARGIN | {"t": TOP_PX},
+        "yaxis": rows,
         **heat,
-        **{f"yaxis{a + 2}": {"domain": [max(0.0, paper(y + lane_px)), paper(y)]} for a, y in enumerate(tops)},
-        "legend": LEGEND | {"y": paper(-6.0), "itemclick": "toggle", "title": _heading("Work of each arm")},
-        "legend2": LEGEND
-        | {
-            "y": paper(tops[0] - NAME_PX - 6.0),
-            "itemdoubleclick": "toggleothers",
-            "title": _heading(f"Motor temperatures{' of the hottest arms' if overview else ''}"),
-        },
+        **{f"yaxis{lane + 2}": {"domain": domain} for lane, domain in enumerate(domains[first:])},
+        "legend": LEGEND | {"y": 1.0 + 6.0 / total_px, "itemclick": "toggle", "title": _heading("Work of each arm")},
+        "legend2": LEGEND | {"y": above, "itemdoubleclick": "toggleothers", "title": temperatures},
         "annotations": [
-            *([title("Hottest motor of each arm", map_top - 8.0)] if overview else []),
-            *(title(plain(arms[a], STREAM_NAME), y - 2.0, size=12) for a, y in zip(lanes, tops, strict=True)),
+            *([title("Hottest motor of each arm", tops[1], 8.0)] if overview else []),
+            *(title(plain(arms[a], STREAM_NAME), top, 2.0, 12) for a, top in zip(lanes, tops[first:], strict=True)),
         ],
     }
 
@@ -379,15 +362,6 @@ def _blocks(arms: Sequence[str], lanes: Sequence[int], legend_px: float) -> dict
 def _heading(text: str) -> dict[str, Any]:
     """Title of a legend, above its entries; so the two cannot overlap."""
     return {"text": f"<b>{text}</b>", "side": "top", "font": {"size": 15}}
-
-
-def _legend_height(bars: Sequence[Trace]) -> float:
-    """Height of the upper legend, px; on a narrow page it has several lines, with columns of equal width."""
-    wide = [45.0 + 6.5 * len(trace["name"]) for trace in bars]
-    if sum(wide) <= NARROW_PX:
-        return LEGEND_ROW_PX
-    per_row = max(1, int(NARROW_PX // max(wide)))
-    return LEGEND_ROW_PX * -(-len(wide) // per_row)
 
 
 def _outages(outages: Sequence[Outage], arms: Sequence[str], unit_s: float) -> list[dict[str, Any]]:
