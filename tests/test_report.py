@@ -436,7 +436,7 @@ OUT = (event(10.0, "fault", job="", reason="joint 2 passed 75 °C"), event(590.0
     ("before", "temp_c", "reason"),
     [
         ((*done("short-1", 0, 200), *done("short-2", 200, 400), *done("long-2", 400, 590)), 30.0,
-         "3 other jobs went first on arm_a, 2 of them shorter"),
+         "3 other jobs went first on arm_a"),
         (done("long-2", -10, 590), 30.0, "arm_a was at work since before its release"),
         (OUT, 30.0, "arm_a was out after a fault"),
         (FAULTED, 30.0, "arm_a faulted during it at 0:02:30"),

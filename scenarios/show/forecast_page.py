@@ -24,49 +24,33 @@ MINUTE_S = 60.0
 
 
 def summary(found: ThermalForecast, so_far: Recording, repetitions: int) -> list[str]:
-    """What a forecast says, in sentences."""
+    """The hottest motor at the end, and the highest safe start, in sentences; `limit_table` has the rest."""
     low, middle, high = (each[-1] for each in found.interval())
-    hottest = int(middle.argmax())
-    warning_c, error_c = LIMITS_C[1:]
-    sentences = [
-        f"After {_times(repetitions)}, {duration(found.run_s)}, joint {hottest + 1} is the hottest: "
+    hottest, warning_c = int(middle.argmax()), ThermalLimits().warning_c
+    warmer_k = found.safe_start_k(warning_c)
+    times = "1 repetition" if repetitions == 1 else f"{repetitions} repetitions"
+    first = (
+        f"After {times}, {duration(found.run_s)}, joint {hottest + 1} is the hottest: "
         f"{middle[hottest]:.1f} °C (95 % interval {low[hottest]:.1f} to {high[hottest]:.1f}), now "
-        f"{so_far_c(so_far)[hottest]:.1f} °C.",
-        f"P(a motor reaches {warning_c:g} °C) {_p(found, warning_c)}; P({error_c:g} °C) {_p(found, error_c)}.",
-    ]
-    longest_s, warmer_k = found.longest_s(warning_c), found.safe_start_k(warning_c)
-    simulated = duration(float(found.time_s[-1]))
-    run = f"more than {simulated}" if math.isinf(longest_s) else "none, a motor is already there"
-    if 0 < longest_s < math.inf:
-        run = f"{duration(longest_s)}, {_times(int(longest_s / found.cycle_s))}"
-    sentences.append(f"Longest run in which P({warning_c:g} °C) is at most {100 * RISK:g} %: {run}.")
+        f"{so_far_c(so_far)[hottest]:.1f} °C."
+    )
     if math.isinf(warmer_k):
-        sentences.append(f"No start is safe: P({warning_c:g} °C) is higher even from an arm at {found.ambient_c:g} °C.")
-        return sentences
+        at = f"from an arm at {found.ambient_c:g} °C"
+        return [first, f"No start is safe: P({warning_c:g} °C) is more than {100 * RISK:g} % even {at}."]
     # Rounded down, so that it is below the limit.
     start_c = math.floor(10.0 * (float(so_far_c(so_far).max()) + warmer_k) - 1e-6) / 10.0
     than = f"{abs(warmer_k):.1f} K {'warmer' if warmer_k >= 0 else 'cooler'} than now"
-    sentences.append(
+    return [
+        first,
         f"Highest safe start of the planned run: hottest motor at {start_c:.1f} °C, if all motors and housings are "
-        f"{than}."
-    )
-    return sentences
+        f"{than}.",
+    ]
 
 
 def so_far_c(so_far: Recording) -> Array:
     """Last motor temperatures of a log, °C, [joint]."""
     assert so_far.temp_c is not None, "a forecast starts from temperatures"
     return so_far.temp_c[-1]
-
-
-def _p(found: ThermalForecast, limit_c: float) -> str:
-    """Probability of reaching a limit in the run: `= 0.12`, or `<` the least that the samples resolve."""
-    probability, least = found.probability(limit_c), 1.0 / SAMPLES
-    return f"< {least:g}" if probability < least else f"= {probability:.2f}"
-
-
-def _times(repetitions: int) -> str:
-    return "1 repetition" if repetitions == 1 else f"{repetitions} repetitions"
 
 
 def joint_table(found: ThermalForecast, so_far: Recording) -> Table:
@@ -87,33 +71,13 @@ def joint_table(found: ThermalForecast, so_far: Recording) -> Table:
     return Table(head=head, rows=tuple(rows))
 
 
-def limit_table(found: ThermalForecast) -> Table:
-    """Probability and time of reaching each limit in the run, and the longest run below it."""
-    rows = []
-    for limit_c in LIMITS_C:
-        early_s, middle_s, _ = found.reached_s(limit_c)
-        longest_s = found.longest_s(limit_c)
-        rows.append(
-            (
-                f"{limit_c:g} °C",
-                _p(found, limit_c).removeprefix("= "),
-                *("–" if math.isinf(s) else duration(s) for s in (early_s, middle_s)),
-                f"> {duration(float(found.time_s[-1]))}" if math.isinf(longest_s) else duration(longest_s),
-            )
-        )
-    head = ("limit", "P in the run", Column("earliest", words=True), Column("median", words=True), "longest run")
-    note = f"Earliest: {100 * RISK:g} % quantile. Longest run: P(reaching the limit) is at most {100 * RISK:g} %."
-    return Table(head=head, rows=tuple(rows), notes=(note,))
-
-
-def card(found: ThermalForecast, so_far: Recording, origin: Mapping[str, str]) -> dict[str, Any]:
-    """The numbers of a forecast as JSON, and from what they were made."""
-    low, middle, high = found.interval()
+def limits(found: ThermalForecast) -> list[dict[str, Any]]:
+    """Probability and times of reaching each limit in the run, and what is safe; None where it is never reached."""
 
     def finite(value: float) -> float | None:
         return None if math.isinf(value) else value
 
-    limits = [
+    return [
         {
             "limit_c": limit_c,
             "p": found.probability(limit_c),
@@ -123,13 +87,35 @@ def card(found: ThermalForecast, so_far: Recording, origin: Mapping[str, str]) -
         }
         for limit_c in LIMITS_C
     ]
+
+
+def limit_table(found: ThermalForecast) -> Table:
+    """Probability and time of reaching each limit in the run, and the longest run below it."""
+    least, simulated = 1.0 / SAMPLES, f"> {duration(float(found.time_s[-1]))}"
+    rows = [
+        (
+            f"{each['limit_c']:g} °C",
+            f"< {least:g}" if each["p"] < least else f"{each['p']:.2f}",
+            *("–" if (s := each["reached_s"][name]) is None else duration(s) for name in ("early", "median")),
+            simulated if each["longest_s"] is None else duration(each["longest_s"]),
+        )
+        for each in limits(found)
+    ]
+    head = ("limit", "P in the run", Column("earliest", words=True), Column("median", words=True), "longest run")
+    note = f"Earliest: {100 * RISK:g} % quantile. Longest run: P(reaching the limit) is at most {100 * RISK:g} %."
+    return Table(head=head, rows=tuple(rows), notes=(note,))
+
+
+def card(found: ThermalForecast, so_far: Recording, origin: Mapping[str, str]) -> dict[str, Any]:
+    """The numbers of a forecast as JSON, and from what they were made."""
+    low, middle, high = found.interval()
     courses = {"low_c": low, "median_c": middle, "high_c": high}
     return {
         "origin": dict(origin),
         "run_s": found.run_s,
         "cycle_s": found.cycle_s,
         "now_c": so_far_c(so_far).tolist(),
-        "limits": limits,
+        "limits": limits(found),
         "time_s": found.time_s[found.in_run].tolist(),
         **{name: np.round(values, 3).tolist() for name, values in courses.items()},
     }

@@ -5,7 +5,6 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from statistics import median
 from typing import Any, NamedTuple  # Any: values of a card
 from urllib.parse import quote
 
@@ -290,7 +289,11 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
     most = max(waits_s, key=lambda why: waits_s[why])
     if not waits_s[most]:
         return f"what {names_text(able)} did meanwhile is not recorded"
-    return _passed(log, late, able, begin_s, end_s) if most == "" else f"{names_text(able)} {most}"
+    if most:
+        return f"{names_text(able)} {most}"
+    ahead = [s for s in log.plan.assignments if s.arm in able and begin_s <= s.start_s < end_s and s.job != late.job]
+    arms = [arm for arm in log.arms if any(span.arm == arm for span in ahead)]
+    return f"{len(ahead)} other job{'s' * (len(ahead) > 1)} went first on {names_text(arms)}"
 
 
 def _arm_time(log: ShiftLog, able: Sequence[str], begin_s: float, end_s: float) -> dict[str, float]:
@@ -314,32 +317,6 @@ def _arm_time(log: ShiftLog, able: Sequence[str], begin_s: float, end_s: float) 
         time_s[hot] += step_s * float((peak_c >= log.limits.warning_c).sum())
         time_s[idle] += step_s * float((peak_c < log.limits.warning_c).sum())
     return time_s
-
-
-def _passed(log: ShiftLog, late: LateJob, able: Sequence[str], begin_s: float, end_s: float) -> str:
-    """How many jobs were awarded before a late one to arms that can do it, and what most of them have in common."""
-    ahead = [a for a in log.plan.assignments if a.arm in able and begin_s <= a.start_s < end_s and a.job != late.job]
-    records = {record.job: record for record in log.jobs}
-    took_s = {(o.arm, o.job, o.time_s): o.duration_s for o in log.offers if o.duration_s}
-    like = [s for (_, job, _), s in took_s.items() if job == late.job]
-    own = records.get(late.job)
-    if own is not None and not like:  # never awarded: by the time per cycle of jobs of its stream
-        alike = [(s, records[job]) for (_, job, _), s in took_s.items() if stream_of(job) == stream_of(late.job)]
-        like = [s / record.cycles * own.cycles for s, record in alike if record.cycles]
-    own_s = median(like) if like else 0.0
-    counts = dict.fromkeys(("shorter", "worth more", "due earlier", "worth more per minute"), 0)
-    for span in ahead:
-        span_s = took_s.get((span.arm, span.job, span.start_s), math.inf)
-        counts["shorter"] += span_s < own_s
-        if own is not None and (other := records.get(span.job)) is not None:
-            counts["worth more"] += other.value > own.value
-            counts["due earlier"] += other.due_s < own.due_s
-            counts["worth more per minute"] += other.value * own_s > own.value * span_s
-    most = max(counts, key=lambda trait: counts[trait])
-    share = "all" if counts[most] == len(ahead) else str(counts[most])
-    which = f", {share} of them {most}" if 2 * counts[most] > len(ahead) else ""
-    arms = [arm for arm in log.arms if any(span.arm == arm for span in ahead)]
-    return f"{len(ahead)} other job{'s' * (len(ahead) > 1)} went first on {names_text(arms)}{which}"
 
 
 MOST_LATE = 50
