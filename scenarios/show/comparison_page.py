@@ -1,5 +1,6 @@
 """A comparison as text, and as one HTML file that opens offline: verdict, intervals, charts and its command."""
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +18,7 @@ from scenarios.show import charts
 from scenarios.show.charts import COLOURS, LAYOUT, MARGIN, SYMBOLS, Figure, Trace, axis, plain
 from scenarios.show.page import Chart, Section, sections_page
 from scenarios.show.words import value_text
-from scenarios.table import Column, Table
+from scenarios.table import Table
 
 Array = np.ndarray
 Range = tuple[float, float, float]
@@ -53,22 +54,6 @@ def narrow_score_tables(scores: SuiteScores, labels: Mapping[str, str] | None = 
     return table.select(0, 1, 2, 3, 7), table.select(0, 4, 5, 6)
 
 
-def failure_table(failures: Sequence[Failed]) -> Table:
-    """Number of failed shifts of each policy, with the first one."""
-    first = _first(failures)
-    counts = {policy: sum(each.policy == policy for each in failures) for policy in first}
-    rows = tuple((label(p), str(counts[p]), each.instance, str(each.seed)) for p, each in first.items())
-    return Table(head=("failed policy", "shifts", Column("first in", words=True), "seed"), rows=rows)
-
-
-def _first(failures: Sequence[Failed]) -> dict[str, Failed]:
-    """The first failure of each policy."""
-    first: dict[str, Failed] = {}
-    for each in failures:
-        first.setdefault(each.policy, each)
-    return first
-
-
 def result_text(result: Comparison) -> Group:
     """The table of a comparison, then its scores, illegal actions and failures, for a console of rich."""
     parts: list[RenderableType] = [result.table] if result.figures else []
@@ -79,10 +64,10 @@ def result_text(result: Comparison) -> Group:
         parts.append(Text(NO_SCORES_RANDOMISED if result.randomise else NO_SCORES))
     if illegal := _illegal([result]):
         parts.append(Text(illegal))
-    if result.failures:
-        shown = list(_first(result.failures).values())[:MOST_TRACES]
-        texts = [Text(f"\n{label(each.policy)}: {each.error}\n{each.trace}".rstrip()) for each in shown]
-        parts += [failure_table(result.failures), *texts]
+    first = {each.policy: each for each in reversed(result.failures)}
+    for policy, count in Counter(each.policy for each in result.failures).most_common(MOST_TRACES):
+        shifts = f"{label(policy)} failed in {count} shift{'s' * (count > 1)}, first in"
+        parts.append(Text(f"\n{shifts} {_failure_text(first[policy])}\n{first[policy].trace}".rstrip()))
     if not result.figures:
         parts.append(Text(f"No differences: the baseline {label(result.baseline)} failed. Give another --baseline."))
     return Group(*parts)
@@ -172,7 +157,7 @@ def _sections(judged: Judged) -> Iterator[Section]:
     sentences = [_illegal(judged.results) or "No illegal action.", *(["No policy failed."] if not failures else [])]
     if len(failures) > MOST_FAILURES:
         sentences.append(f"{len(failures) - MOST_FAILURES} more are in results.parquet.")
-    traces = tuple((_failure_text(each), each.trace) for each in failures[:MOST_FAILURES])
+    traces = tuple((f"{label(each.policy)}, {_failure_text(each)}", each.trace) for each in failures[:MOST_FAILURES])
     yield Section(key="failures", title="Failures and illegal actions", sentences=tuple(sentences), details=traces)
     hashes = [f"{digest}  {name}" for name, digest in judged.card["instances"].items()]
     about = "Every shift is a row of results.parquet beside this page; study.json has these hashes."
@@ -300,8 +285,7 @@ def _heat_chart(result: Comparison, number: int) -> Chart | None:
 
 
 def _failure_text(each: Failed) -> str:
-    where = f"{label(each.policy)}, {each.instance}, fleet {each.fleet}, training {each.training}, seed {each.seed}"
-    return f"{where}: {each.error}"
+    return f"{each.instance}, fleet {each.fleet}, training {each.training}, seed {each.seed}: {each.error}"
 
 
 def _origin(judged: Judged) -> Table:
