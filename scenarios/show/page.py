@@ -127,8 +127,8 @@ class Page:
         code = [static(name) for name in ("unpack.js", "figure.js", *(("cell.js", "replay.js") if replay else ()))]
         begin = f"startReplay({replay.unit_s},{json.dumps(replay.clock)})" if replay else ""
         play = f'await runLibrary("three");const shift=await {begin};' if replay else ""
-        draw = f"const figure=await drawFigures({json.dumps(_PLOTLY_OPTIONS)});" if self.charts else ""
-        join = "shift.attach(figure);" if replay and self.charts else ""
+        draw = f"const figures=await drawFigures({json.dumps(_PLOTLY_OPTIONS)});" if self.charts else ""
+        join = "shift.attach(figures);" if replay and self.charts else ""
         start = f'async function start(){{startFilters();{play}{draw}{join}document.body.dataset.ready="all";}}'
         failed = "start().catch((error)=>{document.title+=' (incomplete)';console.error(error);});"
         return f"{''.join(code)}\n{start}\n{failed}"

@@ -14,7 +14,7 @@ from fleet.env.render.heat import heat_scale
 from fleet.events import Event
 from scenarios.run.records import JobSpan, Offer, ShiftLog
 from scenarios.show.page import Chart, Page, Playback, packed
-from scenarios.show.timeline import figure, hottest_motors, stream_of, time_unit
+from scenarios.show.timeline import hottest_motors, shift_charts, stream_of, time_unit
 from scenarios.show.words import clock, duration, kind_text, names_text, offer_text, offers_text, value_text
 from scenarios.table import Column, Moment, Table, render
 
@@ -357,7 +357,7 @@ def report_html(log: ShiftLog, model: Mapping[str, Any] | None = None) -> str:
     if model is not None and len(log.readings.time_s):
         replay = _playback([log], model)
     scenario = card.get("scenario", {})
-    outcome = verdict(log)
+    outcome, figures = verdict(log), shift_charts(log)
     content = {
         "verdict": outcome,
         "first": next(iter(outcome.moments.values()), None),
@@ -365,6 +365,7 @@ def report_html(log: ShiftLog, model: Mapping[str, Any] | None = None) -> str:
         "how": " · ".join(_settings(card, log.arms)),
         "tiles": key_figures(card.get("metrics") or {}),
         "replay": replay is not None,
+        "charts": figures,
         "late": _late_table(log),
         "events": _event_table(log),
         "awards": _award_table(log),
@@ -373,8 +374,7 @@ def report_html(log: ShiftLog, model: Mapping[str, Any] | None = None) -> str:
     }
     seed = f" · seed {card['seed']}" if "seed" in card else ""
     title = f"{scenario.get('name', 'unnamed scenario')} · {log.policy}{seed}"
-    chart = Chart(key="drawn", figure=figure(log), alt="Work and motor temperatures of each arm over the shift")
-    return Page(title=title, template="run.html", content=content, charts=(chart,), replay=replay).html()
+    return Page(title=title, template="run.html", content=content, charts=[*figures.values()], replay=replay).html()
 
 
 def _playback(logs: Sequence[ShiftLog], model: Mapping[str, Any]) -> Playback:

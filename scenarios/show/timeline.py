@@ -1,4 +1,4 @@
-"""Figures of shifts: Gantt chart above and motor temperatures below, or the hottest motors of several shifts."""
+"""Charts of shifts: work of each arm, motor temperatures, and the hottest motors of several shifts."""
 
 import base64
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +12,8 @@ from fleet.robot import JOINTS
 from fleet.telemetry import Telemetry
 from scenarios.run.records import JobSpan, Outage, ShiftLog
 from scenarios.show import charts
-from scenarios.show.charts import AXIS, FAULT, INK, LAYOUT, WARNING, Trace, plain
+from scenarios.show.charts import AXIS, FAULT, INK, WARNING, Trace, plain
+from scenarios.show.page import Chart
 from scenarios.show.words import clock, duration, event_text
 
 Array = np.ndarray
@@ -20,7 +21,7 @@ Span = TypeVar("Span", JobSpan, Outage)
 
 STREAM_COLOURS = ("#4477aa", "#ddaa33", "#228833", "#aa4499", "#66ccee", "#997755", "#999933", "#555566")
 FAILURE, BREAK = "#444444", "#8a8a8a"
-BAR = {"type": "bar", "orientation": "h", "legend": "legend"}
+BAR = {"type": "bar", "orientation": "h"}
 BAR_HEIGHT, BREAK_HEIGHT = 0.62, 0.24
 """In rows; an arm may work in a break."""
 LATE = {"color": INK, "width": 1.6}
@@ -40,63 +41,44 @@ MOST_LANES, HOTTEST = 16, 5
 HEAT_BINS = 1440
 """Columns of the heat map."""
 
-MARGIN = {"l": 90, "r": charts.LIMITS_PX, "b": 52}
-TOP_PX = 64.0
-"""Room for the upper legend on one line; the page makes more where it has several."""
-NAME_PX = 20.0
-"""Height of the name of an arm above its lane."""
-MAP_GAP_PX, MAP_ROW_PX = 90.0, 8.0
-GAP_PX = 172.0
-"""Height between the two blocks, for an axis, a title and a legend."""
+MAP_ROW_PX = 8.0
 BETWEEN_LANES_PX = 28.0
-
-SHIFT_LAYOUT = LAYOUT | {"modebar": {"orientation": "v"}, "barmode": "overlay", "dragmode": "zoom"}
-LEGEND = {
-    "orientation": "h",
-    "x": 0,
-    "xanchor": "left",
-    "yanchor": "bottom",
-    "bgcolor": "rgba(255,255,255,0)",
-    "tracegroupgap": 0,
-}
-TEXT = {"xref": "paper", "xanchor": "left", "showarrow": False}
+AROUND_PX = 100.0
+"""Height of the axis of time and the legend; the page makes more where a legend has several lines."""
+TEXT = {"xref": "paper", "xanchor": "left", "yanchor": "bottom", "showarrow": False, "font": {"size": 12}}
+LAYOUT = charts.WITH_LEGEND | {"margin": charts.MARGIN | {"l": 90, "r": charts.LIMITS_PX, "b": 52}, "dragmode": "zoom"}
 
 
-def figure(log: ShiftLog) -> dict[str, Any]:
-    """The figure: `data` and `layout` in Plotly's schema."""
-    plan, telemetry, arms = log.plan, log.readings, log.arms
-    unit, unit_s = time_unit(plan.horizon_s)
-    bars = _gantt(log, unit_s)
-    lanes = _lanes(telemetry, len(arms))
-    overview = len(lanes) < len(arms)
-    time = AXIS | {
-        "range": [0, max(plan.horizon_s / unit_s, 1e-3)],
-        "title": {"text": _time_title(log, unit), "standoff": 6},
-        "domain": [0, 1],
+def shift_charts(log: ShiftLog) -> dict[str, Chart]:
+    """Charts of a shift by heading; their axes show the same times."""
+    arms, lanes = log.arms, _lanes(log.readings, len(log.arms))
+    unit, unit_s = time_unit(log.plan.horizon_s)
+    title = {"text": _time_title(log, unit), "standoff": 6}
+    time = AXIS | {"range": [0, max(log.plan.horizon_s / unit_s, 1e-3)], "title": title}
+    rows = charts.named_rows([plain(arm, ARM_NAME) for arm in arms], fixedrange=True)
+    heat_map, which = {}, ""
+    if len(lanes) < len(arms):
+        every, which = -(-len(arms) // 50), " of the hottest arms"
+        rows |= {"tickfont": {"size": 8}, **{name: rows[name][::every] for name in ("tickvals", "ticktext")}}
+        heat_map = {"Hottest motor of each arm": _heat_map(log, time, rows, unit, unit_s)}
+    figures = {
+        "Work of each arm": _work(log, time, rows, unit_s),
+        **heat_map,
+        f"Motor temperatures{which}": _temperatures(log, lanes, time, unit, unit_s),
     }
-    layout = SHIFT_LAYOUT | _blocks(arms, lanes)
-    layout["xaxis"] = time | {"anchor": "y"}
-    layout["xaxis2"] = time | {"anchor": f"y{len(lanes) + 1}", "matches": "x"}
-    shown_c = charts.range_c(telemetry.temp_c, log.limits)
-    temperature = charts.axis("°C", range=shown_c, anchor="x2", nticks=6)
-    layout["shapes"] = []
-    for lane in range(len(lanes)):
-        key = f"yaxis{lane + 2}"
-        layout[key] = temperature | layout[key] | ({"matches": "y2"} if lane else {})
-        shapes, labels = charts.limit_lines(log.limits, f"y{lane + 2}")
-        layout["shapes"] += shapes
-        layout["annotations"] += labels
-    layout["shapes"] += _outages(plan.outages, [arms[a] for a in lanes], unit_s)
-    data = [*bars, *_temperatures(telemetry, arms, lanes, unit, unit_s)]
-    if overview:
-        number = len(lanes) + 2
-        layout["xaxis3"] = time | {"anchor": f"y{number}", "matches": "x"}
-        # The page may show any other arm in the last lane.
-        title = len(lanes)  # annotations: the title of the heat map, then those of the lanes
-        layout["meta"] = {"lane_traces": list(range(len(data) - JOINTS, len(data))), "lane_title": title}
-        heat = _heat_map(log, number, unit, unit_s)
-        data.append(heat | {"colorbar": heat["colorbar"] | {"y": layout[f"yaxis{number}"]["domain"][1]}})
-    return {"data": data, "layout": layout}
+    return {
+        heading: Chart(key=f"chart-{number}", figure=figure, alt=f"{heading} over the shift")
+        for number, (heading, figure) in enumerate(figures.items())
+    }
+
+
+def _work(log: ShiftLog, time: Trace, rows: Trace, unit_s: float) -> Trace:
+    """The Gantt chart."""
+    count = len(log.arms)
+    height_px = max(90.0, count * (40.0 if count <= 8 else 26.0 if count <= MOST_LANES else 12.0))
+    rows = rows | {"range": [count - 0.4, -0.65]}
+    own = {"height": height_px + AROUND_PX, "barmode": "overlay", "xaxis": time, "yaxis": rows}
+    return {"data": _gantt(log, unit_s), "layout": LAYOUT | own}
 
 
 def hottest_motors(logs: Mapping[str, ShiftLog]) -> dict[str, Any]:
@@ -144,14 +126,9 @@ def _gantt(log: ShiftLog, unit_s: float) -> list[Trace]:
                 "x": [round(e.time_s / unit_s, 5) for e in marked],
                 "y": [arms.index(e.arm) - 0.42 for e in marked],
             }
-            trace = {"type": "scatter", "mode": "markers", "name": kind, "marker": look, "legend": "legend"}
-            traces.append(
-                trace
-                | at
-                | _hover(
-                    [f"<b>{plain(e.arm)}</b> at {clock(e.time_s, log.begin)}<br>{plain(event_text(e))}" for e in marked]
-                )
-            )
+            trace = {"type": "scatter", "mode": "markers", "name": kind, "marker": look}
+            texts = [f"<b>{plain(e.arm)}</b> at {clock(e.time_s, log.begin)}<br>{plain(event_text(e))}" for e in marked]
+            traces.append(trace | at | _hover(texts))
     return traces
 
 
@@ -262,8 +239,8 @@ def _lanes(telemetry: Telemetry, arms: int) -> list[int]:
     return np.argsort(-peak_c, kind="stable")[:HOTTEST].tolist()
 
 
-def _heat_map(log: ShiftLog, lane: int, unit: str, unit_s: float) -> Trace:
-    """The hottest motor of each arm over time, one row per arm; y axis `lane`, x axis 3."""
+def _heat_map(log: ShiftLog, time: Trace, rows: Trace, unit: str, unit_s: float) -> Trace:
+    """The hottest motor of each arm over time, one row per arm."""
     telemetry, arms, warning_c, error_c = log.readings, log.arms, log.limits.warning_c, log.limits.error_c
     samples = len(telemetry.time_s)
     edges = np.unique(np.linspace(0, samples, min(samples, HEAT_BINS) + 1).astype(int))[:-1]
@@ -275,7 +252,7 @@ def _heat_map(log: ShiftLog, lane: int, unit: str, unit_s: float) -> Trace:
     kelvin = np.clip(np.round((peak_c - low) * 2), 0, 255).astype(np.uint8)
     shares = (marks - low) / (high - low)
     names = [plain(arm) for arm in arms]
-    return {
+    heat = {
         "type": "heatmap",
         "z": {
             "dtype": "u1",
@@ -284,8 +261,6 @@ def _heat_map(log: ShiftLog, lane: int, unit: str, unit_s: float) -> Trace:
         },
         "x": charts.packed_numbers(telemetry.time_s[edges] / unit_s),
         "y": list(range(len(arms))),
-        "xaxis": "x3",
-        "yaxis": f"y{lane}",
         "zmin": 0,
         "zmax": 2 * (high - low),
         "colorscale": [[float(share), colour] for share, colour in zip(shares, HEAT, strict=True)],
@@ -296,12 +271,14 @@ def _heat_map(log: ShiftLog, lane: int, unit: str, unit_s: float) -> Trace:
             "thickness": 12,
             "lenmode": "pixels",
             "len": min(200, MAP_ROW_PX * len(arms)),
+            "y": 1,
             "yanchor": "top",
         },
         "customdata": names,
         "hovertemplate": f"%{{y}}<br>%{{x:.2f}} {unit}<extra></extra>",
-        "showlegend": False,
     }
+    height_px = len(arms) * MAP_ROW_PX + AROUND_PX
+    return {"data": [heat], "layout": LAYOUT | {"height": height_px, "xaxis": time, "yaxis": rows}}
 
 
 def time_unit(horizon_s: float) -> tuple[str, float]:
@@ -314,63 +291,13 @@ def _time_title(log: ShiftLog, unit: str) -> str:
     return f"time ({unit})" if log.begin is None else f"time since {log.begin:%a %d %b %H:%M} ({unit})"
 
 
-def _blocks(arms: Sequence[str], lanes: Sequence[int]) -> dict[str, Any]:
-    """Heights, titles and legends of the Gantt chart, of the heat map of a large fleet, and of the lanes."""
-    overview = len(lanes) < len(arms)
-    gantt_px = max(90.0, len(arms) * (40.0 if len(arms) <= 8 else 26.0 if not overview else 12.0))
-    lane_px = 120.0 if len(lanes) <= 8 else 84.0
-    heat_maps = [(MAP_GAP_PX, len(arms) * MAP_ROW_PX)] * overview
-    gaps_px, heights_px = np.array(
-        [(0.0, gantt_px), *heat_maps, (GAP_PX, lane_px), *[(BETWEEN_LANES_PX, lane_px)] * (len(lanes) - 1)]
-    ).T
-    ends_px = np.cumsum(gaps_px + heights_px)
-    total_px = float(ends_px[-1])
-    tops = (1.0 - (ends_px - heights_px) / total_px).tolist()  # in Plotly's coordinate: 1 at the top, 0 at the bottom
-    domains = [[max(0.0, end), top] for end, top in zip((1.0 - ends_px / total_px).tolist(), tops, strict=True)]
-    first = 1 + overview
-
-    def title(text: str, top: float, above_px: float, size: int = 15) -> dict[str, Any]:
-        place = {"x": 0, "y": top + above_px / total_px, "yref": "paper", "yanchor": "bottom"}
-        return TEXT | place | {"text": f"<b>{text}</b>", "font": {"size": size}}
-
-    names = [plain(arm, ARM_NAME) for arm in arms]
-    rows = charts.named_rows(names, domain=domains[0], range=[len(arms) - 0.4, -0.65], fixedrange=True)
-    heat: Trace = {}
-    if overview:
-        rows["tickfont"] = {"size": 8}
-        every = -(-len(arms) // 50)
-        marks = {name: rows[name][::every] for name in ("tickvals", "ticktext")}
-        place = {"domain": domains[1], "anchor": "x3", "range": [len(arms) - 0.5, -0.5]}
-        heat = {f"yaxis{len(lanes) + 2}": rows | place | marks}
-    temperatures = _heading(f"Motor temperatures{' of the hottest arms' if overview else ''}")
-    above = tops[first] + (NAME_PX + 6.0) / total_px
-    return {
-        "height": round(total_px + TOP_PX + MARGIN["b"]),
-        "margin": MARGIN | {"t": TOP_PX},
-        "yaxis": rows,
-        **heat,
-        **{f"yaxis{lane + 2}": {"domain": domain} for lane, domain in enumerate(domains[first:])},
-        "legend": LEGEND | {"y": 1.0 + 6.0 / total_px, "itemclick": "toggle", "title": _heading("Work of each arm")},
-        "legend2": LEGEND | {"y": above, "itemdoubleclick": "toggleothers", "title": temperatures},
-        "annotations": [
-            *([title("Hottest motor of each arm", tops[1], 8.0)] if overview else []),
-            *(title(plain(arms[a], STREAM_NAME), top, 2.0, 12) for a, top in zip(lanes, tops[first:], strict=True)),
-        ],
-    }
-
-
-def _heading(text: str) -> dict[str, Any]:
-    """Title of a legend, above its entries; so the two cannot overlap."""
-    return {"text": f"<b>{text}</b>", "side": "top", "font": {"size": 15}}
-
-
 def _outages(outages: Sequence[Outage], arms: Sequence[str], unit_s: float) -> list[dict[str, Any]]:
     """Faults as vertical lines and outages as shade in the lane of their arm; arms without a lane are left out."""
     shapes = []
     for o in outages:
         if o.arm not in arms:
             continue
-        lane = {"xref": "x2", "yref": f"y{arms.index(o.arm) + 2} domain", "y0": 0, "y1": 1}
+        lane = {"xref": "x", "yref": f"y{arms.index(o.arm) + 1} domain", "y0": 0, "y1": 1}
         start, end = round(o.start_s / unit_s, 5), round(o.end_s / unit_s, 5)
         shapes += [
             lane | {"type": "rect", "x0": start, "x1": end, "fillcolor": FAULT, "opacity": 0.10, "line": {"width": 0}},
@@ -379,18 +306,29 @@ def _outages(outages: Sequence[Outage], arms: Sequence[str], unit_s: float) -> l
     return shapes
 
 
-def _temperatures(
-    telemetry: Telemetry, arms: Sequence[str], lanes: Sequence[int], unit: str, unit_s: float
-) -> list[Trace]:
-    points = int(np.clip(POINTS_IN_ALL // max(1, JOINTS * len(lanes)), FEWEST_POINTS, POINTS_PER_TRACE))
-    traces = []
-    for lane, a in enumerate(lanes):
-        arm = arms[a]
+def _temperatures(log: ShiftLog, lanes: Sequence[int], time: Trace, unit: str, unit_s: float) -> Trace:
+    """All motors of some arms, a lane for each arm."""
+    telemetry, arms, count = log.readings, [log.arms[a] for a in lanes], len(lanes)
+    lane_px = 120.0 if count <= 8 else 84.0
+    total_px = count * (lane_px + BETWEEN_LANES_PX)
+    points = int(np.clip(POINTS_IN_ALL // max(1, JOINTS * count), FEWEST_POINTS, POINTS_PER_TRACE))
+    shown_c = charts.range_c(telemetry.temp_c, log.limits)
+    layout, traces = LAYOUT | {"height": total_px + AROUND_PX, "xaxis": time | {"anchor": f"y{count}"}}, list[Trace]()
+    layout |= {"shapes": _outages(log.plan.outages, arms, unit_s), "annotations": []}
+    for lane, arm in enumerate(arms):
+        bottom, y = 1.0 - (lane + 1) / count, f"y{lane + 1}"
+        own = {"domain": [bottom, bottom + lane_px / total_px], **({"matches": "y"} if lane else {})}
+        layout[f"yaxis{lane + 1 if lane else ''}"] = charts.axis("°C", range=shown_c, nticks=6, **own)
+        lines, labels = charts.limit_lines(log.limits, y)
+        layout["shapes"] += lines
+        text = {"text": f"<b>{plain(arm, STREAM_NAME)}</b>", "x": 0, "y": own["domain"][1], "yref": "paper"}
+        layout["annotations"] += [*labels, TEXT | text]
         for j, (colour, dash) in enumerate(charts.JOINT_LINES):
-            value, name = telemetry.temp_c[:, a, j], f"joint {j + 1}"
+            value, name = telemetry.temp_c[:, lanes[lane], j], f"joint {j + 1}"
             hover = f"{plain(arm)} {name}<br>%{{y:.1f}} °C at %{{x:.2f}} {unit}<extra></extra>"
             line = {"color": colour, "width": 1.5, "dash": dash}
-            place = {"legendgroup": name, "legend": "legend2", "showlegend": lane == 0, "hovertemplate": hover}
-            place |= {"xaxis": "x2", "yaxis": f"y{lane + 2}"}
+            place = {"legendgroup": name, "showlegend": lane == 0, "hovertemplate": hover, "yaxis": y}
             traces.append(charts.curve(name, telemetry.time_s / unit_s, value, line, most=points, **place))
-    return traces
+    if count < len(log.arms):  # the page may show any other arm in the last lane: its traces, and its title
+        layout["meta"] = {"lane_traces": list(range(len(traces) - JOINTS, len(traces))), "lane_title": 3 * count - 1}
+    return {"data": traces, "layout": layout}
