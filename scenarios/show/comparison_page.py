@@ -16,7 +16,7 @@ from scenarios.evaluate.statistics import LEGEND, LEVEL, Interval, profile
 from scenarios.policy_loader import is_on_bus, label
 from scenarios.show import charts
 from scenarios.show.charts import COLOURS, LAYOUT, MARGIN, SYMBOLS, Figure, Trace, axis, plain
-from scenarios.show.page import Chart, Section, sections_page
+from scenarios.show.page import Chart, Head, Page, Section
 from scenarios.show.words import value_text
 from scenarios.table import Table
 
@@ -117,7 +117,8 @@ class Judged:
 
 def comparison_page(judged: Judged) -> str:
     """The page; the same input gives the same text."""
-    return sections_page(judged.title, [*_sections(judged)], _origin(judged), verdict(judged))
+    head = Head(sentences=verdict(judged))
+    return Page(title=judged.title, sections=[*_sections(judged)], head=head, origin=_origin(judged)).html()
 
 
 def _sections(judged: Judged) -> Iterator[Section]:

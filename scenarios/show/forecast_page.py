@@ -8,7 +8,7 @@ import numpy as np
 
 from fleet.robot import JOINTS, ThermalLimits
 from scenarios.show import charts
-from scenarios.show.page import Chart, Section, sections_page
+from scenarios.show.page import Chart, Page, Section, origin_table
 from scenarios.show.words import duration
 from scenarios.table import Column, Table
 from twin.logs.recording import Recording
@@ -132,7 +132,8 @@ def page(found: ThermalForecast, so_far: Recording, repetitions: int, origin: Ma
         charts=(_chart(found, so_far),),
         tables=(limit_table(found), joint_table(found, so_far)),
     )
-    return sections_page(f"Thermal forecast after {so_far.name}", [section], origin)
+    title = f"Thermal forecast after {so_far.name}"
+    return Page(title=title, sections=[section], origin=origin_table(origin)).html()
 
 
 def _chart(found: ThermalForecast, so_far: Recording) -> Chart:

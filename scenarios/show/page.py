@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any  # values of JSON
+from typing import Any, NamedTuple  # Any: values of JSON
 from zipfile import ZipFile
 
 import numpy as np
@@ -19,7 +19,7 @@ from markupsafe import Markup
 from fleet.errors import FleetError, install
 from fleet.telemetry import Telemetry
 from scenarios.show.charts import Figure
-from scenarios.table import Table, render, static
+from scenarios.table import Moment, Table, render, static
 
 Array = np.ndarray
 
@@ -57,9 +57,9 @@ class Section:
     how: str = ""
     """Method."""
     charts: tuple[Chart, ...] = ()
-    tables: tuple[Table, ...] = ()
+    tables: tuple[Table | Markup, ...] = ()
     details: tuple[tuple[str, Table | str], ...] = ()
-    """Headings, and what a click on each shows: a table, or text as it is."""
+    """Headings, and what a click on each shows: a table, HTML, or text as it is."""
     numbers: Mapping[str, Any] = field(default_factory=dict)  # plain values for report.json
     failed: str | None = None
     """Why there is no result; None for a complete section."""
@@ -88,27 +88,65 @@ class Playback:
         return {"ms": 1000 * moment.timestamp(), "zone": zone or "UTC"}
 
 
+class Badge(NamedTuple):
+    """An outcome in a few words."""
+
+    text: str
+    good: bool
+    moment: Moment | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Head:
+    """What a page has above its sections."""
+
+    badges: Sequence[Badge] = ()
+    sentences: Sequence[str] = ()
+    moments: Mapping[str, Moment] = field(default_factory=dict)
+    """Of some of the sentences."""
+    remarks: Sequence[str] = ()
+    tiles: Sequence[tuple[str, str, str]] = ()
+    """Key figures: name, text and style."""
+    replay: Playback | None = None
+    names: Sequence[str] = ("",)
+    """Of the shifts of the replay."""
+    links: Mapping[str, str] = field(default_factory=dict)
+    """Addresses of reports by name."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Page:
-    """A page: a template, what it shows, and the figures and the replay whose places are in the template."""
+    """A page of sections, with the figures and the replay inside."""
 
     title: str
-    template: str
-    content: Mapping[str, object]
-    """Values of the template."""
-    charts: Sequence[Chart] = ()
-    replay: Playback | None = None
-    narrow: bool = False
-    """For text; the default width is for figures over a shift."""
+    sections: Sequence[Section]
+    head: Head = field(default_factory=Head)
+    origin: Table | None = None
+    """From what its figures come."""
+    narrow: bool = True
+    """For text, with links to the sections; otherwise for figures over a shift."""
 
     def html(self) -> str:
         """The whole file; the same page gives the same text."""
         data = self._data()
-        policy = f"script-src 'unsafe-inline'; {_POLICY}" if data else _POLICY
-        head = {"title": self.title, "narrow": self.narrow, "policy": policy, "css": Markup(static("page.css"))}
-        texts = {key: Markup(text) for key, text in data.items()}
-        code = Markup(self._code()) if data else ""
-        return str(render(self.template, **self.content, **head, data=texts, code=code))
+        values = {
+            "title": self.title,
+            "sections": self.sections,
+            "head": self.head,
+            "origin": self.origin,
+            "narrow": self.narrow,
+            "failed": [each.title for each in self.sections if each.failed],
+            "policy": f"script-src 'unsafe-inline'; {_POLICY}" if data else _POLICY,
+            "css": Markup(static("page.css")),
+            "data": {key: Markup(text) for key, text in data.items()},
+            "code": Markup(self._code()) if data else "",
+        }
+        return str(render("page.html", **values)).lstrip()
+
+    @property
+    def charts(self) -> list[Chart]:
+        """Of all sections."""
+        return [chart for each in self.sections for chart in each.charts]
 
     def _data(self) -> dict[str, str]:
         """What scripts read, by the id of the element that holds it."""
@@ -116,14 +154,14 @@ class Page:
         if self.charts:
             data["plotly"] = _plotly_js()
             data |= {chart.key: _json(chart.figure) for chart in self.charts}
-        if self.replay:
-            data |= {"three": _packed_three_js(), "cell-model": _json(self.replay.model)}
-            data |= {f"playback-{number}": shift for number, shift in enumerate(self.replay.shifts)}
+        if self.head.replay:
+            data |= {"three": _packed_three_js(), "cell-model": _json(self.head.replay.model)}
+            data |= {f"playback-{number}": shift for number, shift in enumerate(self.head.replay.shifts)}
         return data
 
     def _code(self) -> str:
         """The scripts, and the function that begins; the replay comes first, since a figure takes longer."""
-        replay = self.replay
+        replay = self.head.replay
         code = [static(name) for name in ("unpack.js", "figure.js", *(("cell.js", "replay.js") if replay else ()))]
         begin = f"startReplay({replay.unit_s},{json.dumps(replay.clock)})" if replay else ""
         play = f'await runLibrary("three");const shift=await {begin};' if replay else ""
@@ -134,21 +172,9 @@ class Page:
         return f"{''.join(code)}\n{start}\n{failed}"
 
 
-def sections_page(
-    title: str, sections: Sequence[Section], origin: Table | Mapping[str, str], lead: Sequence[str] = ()
-) -> str:
-    """A page of sections as HTML text, which opens offline; the same input gives the same text.
-
-    Args:
-        origin: From what its figures come.
-        lead: First sentences.
-    """
-    if not isinstance(origin, Table):
-        origin = Table(head=("", ""), rows=tuple(origin.items()), numbers=False)
-    failed = [each.title for each in sections if each.failed]
-    charts = [chart for each in sections for chart in each.charts]
-    content = {"lead": lead, "sections": sections, "failed": failed, "origin": origin}
-    return Page(title=title, template="sections.html", content=content, charts=charts, narrow=True).html()
+def origin_table(origin: Mapping[str, str]) -> Table:
+    """From what the figures of a page come, by name."""
+    return Table(head=("", ""), rows=tuple(origin.items()), numbers=False)
 
 
 @cache

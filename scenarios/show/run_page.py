@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any, NamedTuple  # Any: values of a card
@@ -13,7 +13,7 @@ import numpy as np
 from fleet.env.render.heat import heat_scale
 from fleet.events import Event
 from scenarios.run.records import JobSpan, Offer, ShiftLog
-from scenarios.show.page import Chart, Page, Playback, packed
+from scenarios.show.page import Badge, Chart, Head, Page, Playback, Section, packed
 from scenarios.show.timeline import hottest_motors, shift_charts, stream_of, time_unit
 from scenarios.show.words import clock, duration, kind_text, names_text, offer_text, offers_text, value_text
 from scenarios.table import Column, Moment, Table, render
@@ -357,24 +357,29 @@ def report_html(log: ShiftLog, model: Mapping[str, Any] | None = None) -> str:
     if model is not None and len(log.readings.time_s):
         replay = _playback([log], model)
     scenario = card.get("scenario", {})
-    outcome, figures = verdict(log), shift_charts(log)
-    content = {
-        "verdict": outcome,
-        "first": next(iter(outcome.moments.values()), None),
-        "description": str(scenario.get("description") or ""),
-        "how": " · ".join(_settings(card, log.arms)),
-        "tiles": key_figures(card.get("metrics") or {}),
-        "replay": replay is not None,
-        "charts": figures,
-        "late": _late_table(log),
-        "events": _event_table(log),
-        "awards": _award_table(log),
-        "requests": _request_table(card.get("requests") or ()),
-        "provenance": _provenance(card),
-    }
+    outcome = verdict(log)
+    sections = [
+        Section(key=chart.key.replace("chart", "figure"), title=heading, charts=(chart,))
+        for heading, chart in shift_charts(log).items()
+    ]
+    if late := _late_table(log):
+        sections.append(Section(key="late", title="Late jobs", tables=(late,)))
+    sections += [_event_section(log), *_award_section(log)]
+    if requests := _request_table(card.get("requests") or ()):
+        sections.append(Section(key="requests", title="Requests of people", tables=(requests,)))
+    provenance = (("All settings and figures", _provenance(card).html()),)
+    sections.append(Section(key="provenance", title="Provenance", details=provenance))
     seed = f" · seed {card['seed']}" if "seed" in card else ""
+    head = Head(
+        badges=[Badge(outcome.badge, outcome.good, next(iter(outcome.moments.values()), None))],
+        sentences=outcome.sentences,
+        moments=outcome.moments,
+        remarks=[*filter(None, [scenario.get("description")]), " · ".join(_settings(card, log.arms))],
+        tiles=key_figures(card.get("metrics") or {}),
+        replay=replay,
+    )
     title = f"{scenario.get('name', 'unnamed scenario')} · {log.policy}{seed}"
-    return Page(title=title, template="run.html", content=content, charts=[*figures.values()], replay=replay).html()
+    return Page(title=title, sections=sections, head=head, narrow=False).html()
 
 
 def _playback(logs: Sequence[ShiftLog], model: Mapping[str, Any]) -> Playback:
@@ -491,16 +496,19 @@ def numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
     return values | {name: max(by_arm.values()) for name, by_arm in own.items() if by_arm}
 
 
-def _event_table(log: ShiftLog) -> Mapping[str, object] | None:
-    """The notable events by time, how many there are, and which are left out; None if there are none."""
+def _event_section(log: ShiftLog) -> Section:
+    """The notable events by time, how many there are, and which are left out."""
     notable = [e for e in log.events if e.kind in NOTABLE]
     if not notable:
-        return None
+        return Section(key="log", title="Events", sentences=("No fault, no warning, no lost claim.",))
     first = sorted(notable, key=lambda e: (NOTABLE.index(e.kind), e.time_s))
     listed, rest = first[:ROWS], first[ROWS:]
-    counts = Counter(e.kind for e in notable)
-    omitted = _counted(Counter(e.kind for e in rest))
-    left_out = f"{len(listed)} of {len(notable)} are listed; left out: {omitted}. The event log has all of them."
+    sentences = [f"{_counted(Counter(e.kind for e in notable))}."]
+    if rest:
+        omitted = _counted(Counter(e.kind for e in rest))
+        sentences.append(
+            f"{len(listed)} of {len(notable)} are listed; left out: {omitted}. The event log has all of them."
+        )
     listed.sort(key=lambda e: (e.time_s, e.arm, NOTABLE.index(e.kind)))
     table = Table(
         head=("time", "event", "arm", "job", "reason"),
@@ -508,24 +516,19 @@ def _event_table(log: ShiftLog) -> Mapping[str, object] | None:
         numbers=False,
     )
     kinds, moments = [e.kind for e in listed], [_before(event) for event in listed]
-    return {
-        "counts": f"{_counted(counts)}.",
-        "omitted": left_out if rest else "",
-        "lost": bool(counts["lost"]),  # the page hides their rows at first
-        "only_lost": len(counts) == 1,
-        "rows": table.html(style="events", key="events", kinds=kinds, moments=moments),
-    }
+    shown = table.html(style="events", key="events", kinds=kinds, moments=moments)
+    return Section(key="log", title="Events", sentences=tuple(sentences), tables=(shown,))
 
 
 def _before(event: Event) -> Moment:
     return Moment(max(0.0, event.time_s - BEFORE_S), event.arm)
 
 
-def _award_table(log: ShiftLog) -> Mapping[str, object] | None:
-    """Why each arm got its job: the offers behind each award, side by side; None without offers."""
+def _award_section(log: ShiftLog) -> Iterator[Section]:
+    """Why each arm got its job: the offers behind each award; nothing without offers."""
     awards = [list(group) for _, group in groupby(log.offers, key=lambda o: (o.time_s, o.job))]
     if not awards:
-        return None
+        return
     rows, moments = list[tuple[str, ...]](), list[Moment]()
     for award in awards[:MOST_AWARDS]:
         winner = next(offer for offer in award if offer.awarded)
@@ -533,14 +536,15 @@ def _award_table(log: ShiftLog) -> Mapping[str, object] | None:
         cells = (winner.arm, offer_text(winner), offers_text(others[:MOST_OFFERS]))
         rows.append((clock(winner.time_s, log.begin), winner.job, *cells))
         moments.append(Moment(winner.time_s, winner.arm))
-    head = ("time", "job", "awarded to", "its offer", "other offers, the best first")
-    table = Table(head=head, rows=tuple(rows), numbers=False)
     left = f" The first {MOST_AWARDS} of {len(awards)} are listed; offers.parquet has all of them."
-    return {
-        "count": len(awards),
-        "more": left if len(awards) > MOST_AWARDS else "",
-        "rows": table.html(key="choices", moments=moments),
-    }
+    how = (
+        "P: probability that a motor passes its warning limit. Then the predicted peak, the difficulty d, and the "
+        "duration of the job; in brackets, why the arm could not take it then." + left * (len(awards) > MOST_AWARDS)
+    )
+    head = ("time", "job", "awarded to", "its offer", "other offers, the best first")
+    shown = Table(head=head, rows=tuple(rows), numbers=False).html(key="choices", moments=moments)
+    details = ((f"The offers behind {len(awards)} awards", shown),)
+    yield Section(key="awards", title="Why each arm got its job", how=how, details=details)
 
 
 def _request_table(requests: Sequence[Sequence[str]]) -> Table | None:
@@ -628,29 +632,26 @@ def runs_page(
             alt = f"Hottest motor over the shift under {', '.join(logs)}"
             charts.append(Chart(key="hottest", figure=hottest_motors(logs), alt=alt))
         replay = _playback([*logs.values()], model) if model else None
+    sections, badges = list[Section](), list[Badge]()
+    for number, (name, log) in enumerate(logs.items()):
+        outcome = verdict(log)
+        badges.append(Badge(f"{name}: {outcome.badge}", outcome.good, next(map(_before, log.faults), None)))
+        others = [line for other in logs.values() for line in other_choices(log, other)] if equal_jobs else []
+        sections.append(Section(key=f"run-{number}", title=name, sentences=(*outcome.sentences, *others)))
     hashes = ("code_hash", "scenario_hash")
-    content = {
-        "sentences": lead or (f"The runs differ in {', '.join(differ) or 'nothing'}. {jobs}",),
-        "sides": [
-            {
-                "name": name,
-                "verdict": verdict(log),
-                "first": next(map(_before, log.faults), None),
-                "other_choices": [line for other in logs.values() for line in other_choices(log, other)]
-                if equal_jobs
-                else (),
-                "report": quote((reports or {}).get(name, "")),
-            }
-            for name, log in logs.items()
-        ],
-        "charts": charts,
-        "replays": tuple(logs) if replay else (),
-        "table": table,
-        "origin": Table(
-            head=("run", "hash of the code", "hash of the scenario"),
-            rows=tuple((name, *(str(log.card.get(key, "")) for key in hashes)) for name, log in logs.items()),
-            numbers=False,
-        ),
-    }
+    origin = Table(
+        head=("run", "hash of the code", "hash of the scenario"),
+        rows=tuple((name, *(str(log.card.get(key, "")) for key in hashes)) for name, log in logs.items()),
+        numbers=False,
+    )
+    figures = Section(key="figures", title="Figures", charts=tuple(charts), tables=(table.html(style="compared"),))
+    head = Head(
+        badges=badges,
+        sentences=lead[:1] or (f"The runs differ in {', '.join(differ) or 'nothing'}. {jobs}",),
+        remarks=lead[1:],
+        replay=replay,
+        names=tuple(logs),
+        links={name: quote(path) for name, path in (reports or {}).items()},
+    )
     title = title or f"{len(logs)} runs{'' if 'scenario' in differ else f' of {table.rows[0][1]}'}"
-    return Page(title=title, template="runs.html", content=content, charts=charts, replay=replay).html()
+    return Page(title=title, sections=[figures, *sections], head=head, origin=origin, narrow=False).html()

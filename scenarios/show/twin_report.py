@@ -35,7 +35,7 @@ from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
 from scenarios.result_folder import ResultKind, json_text
 from scenarios.show.charts import AXIS, COLOURS, LAYOUT, Trace, curve
-from scenarios.show.page import Chart, Section, sections_page
+from scenarios.show.page import Chart, Head, Page, Section, origin_table
 from scenarios.spec.jobs import rehearsal_works
 from scenarios.spec.schema import Scenario
 from scenarios.table import Table
@@ -781,7 +781,8 @@ def write(chapters: Sequence[Section], origin: Mapping[str, str], folder: Path, 
 
     The `status` in report.json is finished even where chapters failed.
     """
-    (folder / PAGE).write_text(sections_page(title, chapters, origin, LIMITS), encoding="utf-8")
+    page = Page(title=title, sections=chapters, head=Head(sentences=LIMITS), origin=origin_table(origin))
+    (folder / PAGE).write_text(page.html(), encoding="utf-8")
     failed = {each.key: each.failed for each in chapters if each.failed}
     of_chapters = {
         each.key: {"title": each.title, "found": each.sentences, "how": each.how, "numbers": each.numbers}

@@ -65,7 +65,7 @@ def event_text(event: "Event | ArmEvent") -> str:
     """An event in words, without its time and arm."""
     joint = f", joint {event.joint}" if event.joint else ""
     reason = f": {event.reason}" if event.reason else ""
-    return f"{kind_text(event.kind)}{f' {event.job}' if event.job else ''}{joint}{reason}"
+    return f"{event.kind.replace('_', ' ')}{f' {event.job}' if event.job else ''}{joint}{reason}"
 
 
 def offer_text(offer: "Offer") -> str:
