@@ -57,7 +57,9 @@ class Section:
     how: str = ""
     """Method."""
     charts: tuple[Chart, ...] = ()
-    tables: tuple[Table | Markup, ...] = ()
+    tables: tuple[Table, ...] = ()
+    html: str = ""
+    """Further content, as Markup."""
     details: tuple[tuple[str, Table | str], ...] = ()
     """Headings, and what a click on each shows: a table, HTML, or text as it is."""
     numbers: Mapping[str, Any] = field(default_factory=dict)  # plain values for report.json

@@ -517,7 +517,7 @@ def _event_section(log: ShiftLog) -> Section:
     )
     kinds, moments = [e.kind for e in listed], [_before(event) for event in listed]
     shown = table.html(style="events", key="events", kinds=kinds, moments=moments)
-    return Section(key="log", title="Events", sentences=tuple(sentences), tables=(shown,))
+    return Section(key="log", title="Events", sentences=tuple(sentences), html=shown)
 
 
 def _before(event: Event) -> Moment:
@@ -644,7 +644,7 @@ def runs_page(
         rows=tuple((name, *(str(log.card.get(key, "")) for key in hashes)) for name, log in logs.items()),
         numbers=False,
     )
-    figures = Section(key="figures", title="Figures", charts=tuple(charts), tables=(table.html(style="compared"),))
+    figures = Section(key="figures", title="Figures", charts=tuple(charts), html=table.html(style="compared"))
     head = Head(
         badges=badges,
         sentences=lead[:1] or (f"The runs differ in {', '.join(differ) or 'nothing'}. {jobs}",),
