@@ -439,13 +439,13 @@ def test_trained_sources_have_the_rewards_that_they_always_had(thermofleet, smal
 def test_a_comparison_of_sources_resumes(thermofleet, small_toml, tmp_path, monkeypatch) -> None:
     out = tmp_path / "sources"
     how = ("--fleets", 2, "--trainings", 2, "--first-seed", 10_000, "--workers", 1)
-    names = ("--policies", "wspt,round_robin@blind", "--difficulty", "blind,random,constant,oracle")
+    names = ("--policies", "wspt,round_robin@blind", "--difficulty", "blind,rc-nominal,oracle")
     call = ("compare", small_toml, *names, *how, "--out", out)
     done = thermofleet(*call, "--seeds", 2)
     assert done.code == 0, done.err
-    for name in ("wspt@blind", "wspt@random", "wspt@constant", "wspt@oracle", "round_robin@blind"):
+    for name in ("wspt@blind", "wspt@rc-nominal", "wspt@oracle", "round_robin@blind"):
         assert done.out.count(f"  {name} ") == 1 + len(FIGURES)  # its scope, and each figure
-    assert len(read_rows(out)) == 2 * 2 * (1 + 2 + 1 + 1 + 1)  # random numbers have two trainings
+    assert len(read_rows(out)) == 2 * 2 * 4
     again = thermofleet(*call, "--seeds", 2, "--json")
     alone = thermofleet("compare", small_toml, "--policies", "round_robin", "--difficulty", "blind", *how, "--seeds", 2,
                         "--json")  # fmt: skip
@@ -455,7 +455,7 @@ def test_a_comparison_of_sources_resumes(thermofleet, small_toml, tmp_path, monk
     units, real = [], runner.run_unit
     monkeypatch.setattr(runner, "run_unit", lambda unit, settings: units.append(unit) or real(unit, settings))
     assert thermofleet(*call, "--seeds", 3).code == 0
-    assert [unit.case.seeds for unit in units] == [(10_002,)] * 12
+    assert [unit.case.seeds for unit in units] == [(10_002,)] * 8
 
 
 def test_bad_sources_are_named(thermofleet, small_toml) -> None:
