@@ -22,6 +22,7 @@ from fleet.events import Event
 from fleet.robot import ThermalLimits
 from fleet.telemetry import Telemetry
 from scenarios.run.records import JobRecord, Offer, ShiftLog
+from scenarios.show.charts import decimate
 from scenarios.show.run_page import (
     ROWS,
     figure_table,
@@ -32,7 +33,7 @@ from scenarios.show.run_page import (
     runs_page,
     verdict,
 )
-from scenarios.show.timeline import decimate, figure, stream_of
+from scenarios.show.timeline import shift_charts, stream_of
 
 ARMS = ("arm_0", "arm_1")
 HOSTILE = '</script><img src="https://evil.example/x"><b>-001'
@@ -104,9 +105,9 @@ def held(text: str, key: str) -> str:
     return found
 
 
-def drawn(text: str) -> dict[str, Any]:
-    """The figure as the browser would read it from the page."""
-    return json.loads(held(text, "drawn"))
+def drawn(text: str, chart: int = 0) -> dict[str, Any]:
+    """A chart as the browser would read it from the page: 0 is the work, 1 the temperatures."""
+    return json.loads(held(text, f"chart-{chart}"))
 
 
 def own(text: str) -> str:
@@ -154,29 +155,31 @@ def test_same_input_same_bytes_in_any_order_of_the_log() -> None:
 @pytest.mark.parametrize("count", [1, 5, 16])
 def test_every_arm_has_a_row_and_a_lane_of_seven_motors(count: int) -> None:
     arms = tuple(f"arm_{i}" for i in range(count))
-    shown = drawn(page(events=(), arms=arms, readings=telemetry(50, count)))
-    assert tuple(shown["layout"]["yaxis"]["ticktext"]) == arms
+    text = page(events=(), arms=arms, readings=telemetry(50, count))
+    assert tuple(drawn(text)["layout"]["yaxis"]["ticktext"]) == arms
+    shown = drawn(text, 1)
     names = [note["text"] for note in shown["layout"]["annotations"]]
     for a, arm in enumerate(arms):
         assert f"<b>{arm}</b>" in names
-        lane = [t for t in shown["data"] if t.get("yaxis") == f"y{a + 2}"]
+        lane = [t for t in shown["data"] if t.get("yaxis") == f"y{a + 1}"]
         assert [t["legendgroup"] for t in lane] == [f"joint {j}" for j in range(1, 8)]
         assert all(t["showlegend"] == (a == 0) for t in lane)
-    domains = [shown["layout"][f"yaxis{i if i > 1 else ''}"]["domain"] for i in range(1, count + 2)]
+    domains = [shown["layout"][f"yaxis{i if i > 1 else ''}"]["domain"] for i in range(1, count + 1)]
     assert all(0 <= low < high <= 1 for low, high in domains)
     assert all(upper[0] > lower[1] for upper, lower in pairwise(domains))
-    go.Figure(shown)
+    for chart in range(2):
+        go.Figure(drawn(text, chart))  # raises on any property or value that Plotly does not know
 
 
 def test_every_fault_is_marked_in_gantt_lane_and_table() -> None:
     text = page()
     shown = drawn(text)
-    go.Figure(shown)  # raises on any property or value that Plotly does not know
+    go.Figure(shown)
     (marks,) = [t for t in shown["data"] if t.get("name") == "fault"]
     assert marks["x"] == [20.0]  # 1200 s in minutes
     assert "joint 2 passed 75" in marks["customdata"][0]
-    lines = [s for s in shown["layout"]["shapes"] if s.get("xref") == "x2" and s["type"] == "line"]
-    assert [(s["x0"], s["x1"], s["yref"]) for s in lines] == [(20.0, 20.0, "y2 domain")]
+    lines = [s for s in drawn(text, 1)["layout"]["shapes"] if s.get("xref") == "x" and s["type"] == "line"]
+    assert [(s["x0"], s["x1"], s["yref"]) for s in lines] == [(20.0, 20.0, "y1 domain")]
     (block,) = [t for t in shown["data"] if t.get("name") == "out after a fault"]
     assert (block["base"], block["x"], block["y"]) == ([20.0], [30.0], [0])
     assert own(text).count('<tr class="fault"') == 1
@@ -201,8 +204,8 @@ def test_a_hostile_name_stays_text() -> None:
     elements = Elements(text)
     assert not [tag for tag, _ in elements.tags if tag in ("img", "b")]
     assert elements.words.count(HOSTILE) >= 4  # title, heading, description, table
-    assert text.count("<script") == text.count("</script>") == 3
-    assert "<" not in held(text, "drawn")
+    assert text.count("<script") == text.count("</script>") == 4
+    assert "<" not in held(text, "chart-0") + held(text, "chart-1")
     bars = [t for t in drawn(text)["data"] if t["type"] == "bar"]
     assert not any("<img" in t["name"] or "<img" in "".join(t.get("customdata", [])) for t in bars)
 
@@ -277,7 +280,7 @@ def test_a_long_name_leaves_room_for_the_figure_and_is_no_template() -> None:
 def test_a_short_spike_of_a_long_shift_is_drawn() -> None:
     readings = telemetry(28_800, 1)
     readings.temp_c[12_345, 0, 1] = 99.0
-    shown = figure(log_of(readings, ("a",)))
+    shown = [*shift_charts(log_of(readings, ("a",))).values()][1].figure
     (lane,) = [t for t in shown["data"] if t["name"] == "joint 2"]
     x, y = (np.frombuffer(base64.b64decode(lane[axis]["bdata"]), dtype="<f4") for axis in "xy")
     assert len(x) == len(y) <= 2000
@@ -290,16 +293,17 @@ def test_a_large_fleet_gets_a_heat_map_and_lanes_of_its_hottest_arms() -> None:
     readings = telemetry(7200, 64)
     readings.temp_c[:] = np.minimum(readings.temp_c, 79.0)
     readings.temp_c[3000, 41, 5] = 88.0
-    shown = figure(log_of(readings, arms))
+    _, overview, shown = (chart.figure for chart in shift_charts(log_of(readings, arms)).values())
     lines = [t for t in shown["data"] if t["type"] == "scatter"]
     assert len(lines) == 5 * 7
     assert "arm_41 joint 1" in lines[0]["hovertemplate"]
-    (heat,) = [t for t in shown["data"] if t["type"] == "heatmap"]
+    (heat,) = overview["data"]
     rows, columns = map(int, heat["z"]["shape"].split(","))
     cells = np.frombuffer(base64.b64decode(heat["z"]["bdata"]), np.uint8).reshape(rows, columns)
     assert rows == len(arms)
     assert np.unravel_index(cells.argmax(), cells.shape)[0] == 41
     assert 20.0 + cells.max() / 2 == pytest.approx(85.0, abs=3.1)  # the scale ends 10 K above the limit
+    go.Figure(overview)
     go.Figure(shown)
 
 
@@ -337,7 +341,7 @@ SPARED = side(
 
 def test_each_side_says_what_happened_and_what_became_of_the_job_on_the_other():
     page = page_of(BURNED, SPARED)
-    burned, spared = re.findall(r"<details>(.*?)</details>", page, re.S)
+    burned, spared = re.findall(r'<section id="run-\d">(.*?)</section>', page, re.S)
     assert re.findall(r'class="status (\w+)"[^>]*>([^<]*)<', page) == [
         ("bad", "round_robin: 1 fault"),
         ("good", "wsept: No fault, no late job"),

@@ -186,8 +186,8 @@ def compare_command(
     ),
     difficulty: str = option(
         "Sources of predictions, separated by commas: twin, oracle (simulator), blind (none), or models to "
-        "compare: trained, untrained, unweighted, torque, weighted-torque, rc-nominal, rc, random, inverted, "
-        "constant. With several, POLICY@SOURCE names a policy.",
+        "compare: trained, untrained, unweighted, torque, rc-nominal, rc, random. With several, POLICY@SOURCE "
+        "names a policy.",
         "twin",
     ),
     randomise: list[str] | None = options.RANDOMISE,

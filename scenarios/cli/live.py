@@ -168,7 +168,7 @@ def watch_command(
     endpoint: str = options.ENDPOINT,
     fleet: str = options.FLEET,
     as_json: bool = option("Print one snapshot as JSON.", False, flag="--json"),
-    joints: bool = option("Show every joint; the key j changes that.", False),
+    joints: bool = option("Show every joint.", False),
     scenario: str = option("Scenario of the fleet, to show the remaining time of the shift.", ""),
 ) -> None:
     """Watch temperatures, difficulty, jobs and the age of messages, until the fleet ends or Ctrl-C."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
-from fleet.difficulty import Difficulty, DifficultyModel, difficulty_of_error, heat_weights
+from fleet.difficulty import Difficulty, DifficultyModel, difficulty_of_error
 from fleet.errors import FleetError, nearest
 from fleet.motion import Plan
 from fleet.robot import JOINTS
@@ -162,50 +162,35 @@ class Learned:
 
 
 @dataclass(frozen=True)
-class _Changed:
-    """The predictions of a model, changed."""
+class _Unweighted:
+    """The predictions of a model with d = Σ_k d_k, as in the paper."""
 
     model: DifficultyModel
-    version: str
-    change: Callable[[Difficulty], Difficulty]
+
+    @property
+    def version(self) -> str:
+        return f"{self.model.version}, unweighted"
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
         score = self.model.score(plan, repetitions)
-        return score and self.change(score)
-
-
-def unweighted(model: DifficultyModel) -> _Changed:
-    """The predictions of a model with d = Σ_k d_k, as in the paper."""
-    return _Changed(model, f"{model.version}, unweighted", lambda score: replace(score, weight=None))
-
-
-def inverted(model: DifficultyModel) -> _Changed:
-    """The opposite of a model: d_k and P of hard work are those of easy work."""
-
-    def opposite(score: Difficulty) -> Difficulty:
-        assert score.risk is None or score.risk.offset.shape[-1] == 1, "the opposite of a maximum is not one"
-        risk = score.risk and replace(score.risk, offset=-score.risk.offset, weight=-score.risk.weight)
-        return Difficulty(np.minimum(1.0 - score.per_joint, BELOW_ONE), risk=risk, weight=score.weight)
-
-    return _Changed(model, f"inverted {model.version}", opposite)
+        return score and replace(score, weight=None)
 
 
 @dataclass(frozen=True)
 class _Torque:
-    """d_k from the RMS torque over that of the training motion; P from a regression on the mean squared torque."""
+    """d_k from the RMS torque over that of the training motion, d their sum; P from a regression on squared torque."""
 
     known_nm: Array
     """RMS torque of the training motion, [joint]."""
     risk: DifficultyModel
-    version: str = "torque"
+    version: str = "torque, unweighted"
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
         from twin.baselines import torque_ratio
 
         per_joint = difficulty_of_error(torque_ratio(plan, repetitions, self.known_nm))
         score = self.risk.score(plan, repetitions)
-        weight = heat_weights(self.known_nm**2)
-        return Difficulty(np.minimum(per_joint, BELOW_ONE), risk=score and score.risk, weight=weight)
+        return Difficulty(np.minimum(per_joint, BELOW_ONE), risk=score and score.risk)
 
 
 @dataclass(frozen=True)
@@ -222,22 +207,12 @@ class _Random:
         return Difficulty(drawn[:JOINTS], p_saturation=float(drawn[JOINTS]))
 
 
-@dataclass(frozen=True)
-class _Constant:
-    """The same score for everything."""
-
-    version: str = "constant"
-
-    def score(self, plan: Plan, repetitions: int) -> Difficulty:
-        return Difficulty(np.full(JOINTS, 0.5), p_saturation=0.5)
-
-
 def _vae(planned: PlannedFleet, training: int, *, trained: bool = True, thermometers: bool = True) -> Fleet:
     return planned.scored(planned.learned(training, "excess", trained=trained, thermometers=thermometers))
 
 
-def _changed(planned: PlannedFleet, fleet: Fleet, change: Callable[[DifficultyModel], _Changed]) -> Fleet:
-    return planned.scored([change(arm.model) for arm in fleet.arms])
+def _unweighted(planned: PlannedFleet, fleet: Fleet) -> Fleet:
+    return planned.scored([_Unweighted(arm.model) for arm in fleet.arms])
 
 
 def _torque(planned: PlannedFleet, *, thermometers: bool = True) -> Fleet:
@@ -275,23 +250,22 @@ SOURCES: dict[str, Callable[[PlannedFleet, int], Fleet]] = {
     # d and P of the VAE alone; `twin` has P and peak of the identified thermal network besides.
     "trained": _vae,
     "untrained": partial(_vae, trained=False),
-    "unweighted": lambda planned, training: _changed(planned, _vae(planned, training), unweighted),
+    "unweighted": lambda planned, training: planned.scored(
+        [_Unweighted(arm.model) for arm in _vae(planned, training).arms]
+    ),
     # The same without thermometers: the paper's case.
     "trained-alone": partial(_vae, thermometers=False),
     "untrained-alone": partial(_vae, trained=False, thermometers=False),
-    "torque-alone": lambda planned, _: _changed(planned, _torque(planned, thermometers=False), unweighted),
+    "torque-alone": lambda planned, _: _torque(planned, thermometers=False),
     # RMS torque over that of the training motion.
-    "torque": lambda planned, _: _changed(planned, _torque(planned), unweighted),
-    "weighted-torque": lambda planned, _: _torque(planned),
+    "torque": lambda planned, _: _torque(planned),
     # Thermal networks alone: of a nominal arm, and as identified.
     "rc-nominal": lambda planned, _: _network(planned, "rc-nominal"),
     "rc": lambda planned, _: _network(planned, "rc"),
     "random": _random,
-    "inverted": lambda planned, training: _changed(planned, _vae(planned, training), inverted),
-    "constant": lambda planned, _: planned.scored([_Constant()] * len(planned.arms)),
 }
 """The fleet with the predictions of each source besides `PREPARED`, from its plans and the training, from 0."""
-UNTRAINED = ("torque", "torque-alone", "weighted-torque", "rc-nominal", "rc", "constant")
+UNTRAINED = ("torque", "torque-alone", "rc-nominal", "rc")
 """Sources that do not depend on the training: one stands for all."""
 ALL_SOURCES = (*PREPARED, *SOURCES)
 """Names, as `--difficulty` of `thermofleet compare` takes them."""

@@ -16,7 +16,8 @@ from fleet.bus.security.tls import identified, why_not
 from fleet.errors import BusError
 from fleet.live.monitor.health import MOST_REASONS, ClockProbe, HealthReport, check_health
 from fleet.live.monitor.snapshot import FleetListener, FleetSnapshot
-from scenarios.show.watch import arm_table, format_time, jobs_line, space_line
+from scenarios.show.watch import arm_table, jobs_line, space_line
+from scenarios.show.words import clock
 from scenarios.terminal import echo, out_console, say
 
 PROBE_EVERY_S, REPLY_S = 0.3, 1.0
@@ -114,7 +115,7 @@ def show(endpoint: str, fleet: FleetSnapshot, report: HealthReport) -> None:
     """Print the report on the terminal."""
     trip = "no answer" if report.round_trip_s is None else f"{1000 * report.round_trip_s:.1f} ms"
     out_console.print(f"router      {endpoint}, round trip {trip}", highlight=False)
-    fleet_time = "unknown" if report.time_s is None else format_time(report.time_s)
+    fleet_time = "unknown" if report.time_s is None else clock(report.time_s)
     out_console.print(f"fleet       {report.fleet}, time {fleet_time}", highlight=False, markup=False)
     if report.offsets_s:
         worst = max(report.offsets_s, key=lambda arm: abs(report.offsets_s[arm]))

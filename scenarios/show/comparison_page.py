@@ -1,5 +1,6 @@
 """A comparison as text, and as one HTML file that opens offline: verdict, intervals, charts and its command."""
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,9 +14,11 @@ from scenarios.evaluate.comparison import Comparison, Failed, by_reward
 from scenarios.evaluate.scores import FEWEST, HEADS, Normalised, SuiteScores, ranked, score_cells, scores_of
 from scenarios.evaluate.statistics import LEGEND, LEVEL, Interval, profile
 from scenarios.policy_loader import is_on_bus, label
-from scenarios.show.page import LAYOUT, LEGEND_ABOVE, Chart, Figure, Page, axis, named_rows, plain
+from scenarios.show import charts
+from scenarios.show.charts import COLOURS, LAYOUT, MARGIN, SYMBOLS, Figure, Trace, axis, plain
+from scenarios.show.page import Chart, Head, Page, Section
 from scenarios.show.words import value_text
-from scenarios.table import Column, Table
+from scenarios.table import Table
 
 Array = np.ndarray
 Range = tuple[float, float, float]
@@ -33,15 +36,8 @@ MOST_FAILURES, MOST_TRACES = 20, 8
 THRESHOLDS = np.linspace(-0.5, 1.1, 81)
 WORST = -1.5
 """Scores below are cut in charts."""
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a8a8a", "#7a5195")
-"""Of lines (Okabe & Ito, who are for colour-blind readers, and two more)."""
-DASHES, SYMBOLS = ("solid", "dash", "dot", "dashdot"), ("circle", "square", "diamond", "x")
-"""Of lines and points, which tell equal colours apart."""
-HEIGHT_PX, ROW_PX = 428, 24
-"""Of a chart with a legend, and of a row of `spans`."""
-MARGIN = {"l": 60, "r": 20, "t": 12, "b": 48}
-WITH_LEGEND: dict[str, Any] = LAYOUT | {"height": HEIGHT_PX, "margin": MARGIN | {"t": 40}, "legend": LEGEND_ABOVE}
-WITH_LEGEND |= {"showlegend": True}
+ROW_PX = 24
+"""Of `spans`."""
 NAME = 28
 """Most characters of a policy's name in a chart."""
 
@@ -58,22 +54,6 @@ def narrow_score_tables(scores: SuiteScores, labels: Mapping[str, str] | None = 
     return table.select(0, 1, 2, 3, 7), table.select(0, 4, 5, 6)
 
 
-def failure_table(failures: Sequence[Failed]) -> Table:
-    """Number of failed shifts of each policy, with the first one."""
-    first = _first(failures)
-    counts = {policy: sum(each.policy == policy for each in failures) for policy in first}
-    rows = tuple((label(p), str(counts[p]), each.instance, str(each.seed)) for p, each in first.items())
-    return Table(head=("failed policy", "shifts", Column("first in", words=True), "seed"), rows=rows)
-
-
-def _first(failures: Sequence[Failed]) -> dict[str, Failed]:
-    """The first failure of each policy."""
-    first: dict[str, Failed] = {}
-    for each in failures:
-        first.setdefault(each.policy, each)
-    return first
-
-
 def result_text(result: Comparison) -> Group:
     """The table of a comparison, then its scores, illegal actions and failures, for a console of rich."""
     parts: list[RenderableType] = [result.table] if result.figures else []
@@ -84,10 +64,10 @@ def result_text(result: Comparison) -> Group:
         parts.append(Text(NO_SCORES_RANDOMISED if result.randomise else NO_SCORES))
     if illegal := _illegal([result]):
         parts.append(Text(illegal))
-    if result.failures:
-        shown = list(_first(result.failures).values())[:MOST_TRACES]
-        texts = [Text(f"\n{label(each.policy)}: {each.error}\n{each.trace}".rstrip()) for each in shown]
-        parts += [failure_table(result.failures), *texts]
+    first = {each.policy: each for each in reversed(result.failures)}
+    for policy, count in Counter(each.policy for each in result.failures).most_common(MOST_TRACES):
+        shifts = f"{label(policy)} failed in {count} shift{'s' * (count > 1)}, first in"
+        parts.append(Text(f"\n{shifts} {_failure_text(first[policy])}\n{first[policy].trace}".rstrip()))
     if not result.figures:
         parts.append(Text(f"No differences: the baseline {label(result.baseline)} failed. Give another --baseline."))
     return Group(*parts)
@@ -137,27 +117,53 @@ class Judged:
 
 def comparison_page(judged: Judged) -> str:
     """The page; the same input gives the same text."""
-    scored = judged.scores is not None
-    charts = [*(_score_charts(judged) if scored else []), *_heat_charts(judged)]
+    head = Head(sentences=verdict(judged))
+    return Page(title=judged.title, sections=[*_sections(judged)], head=head, origin=_origin(judged)).html()
+
+
+def _sections(judged: Judged) -> Iterator[Section]:
+    base, scores = label(judged.baseline), judged.scores
+    if scores:
+        means, profiles = _score_charts(judged)
+        how = (
+            f"difference: paired, to {base}; {LEGEND}. IQM: mean of the middle half. better in: share of instances "
+            "with a better score than the baseline. heat binds, it does not: mean scores in instances in which a "
+            "policy that ignores heat is expected to fault, and in the others."
+        )
+        tables, remarks = (score_table(scores),), tuple(scores.remarks)
+        own = {"sentences": remarks, "charts": (means,), "tables": tables, "how": how}
+        yield Section(key="score", title="Normalised score", **own)
+        how = (
+            "Share of instances with a score above each threshold; bands: pointwise 95 % intervals of the best and of "
+            f"{base}."
+        )
+        yield Section(key="profile", title="Performance profiles", charts=(profiles,), how=how)
+    if cells := _cell_table(judged):
+        how = "Mean normalised score; ● best of the column; number of instances in brackets."
+        yield Section(key="cells", title="By cell or scenario", tables=(cells,), how=how)
+    for number, result in enumerate(judged.results):
+        where = f": {result.scenario}" if len(judged.results) > 1 else ""
+        if chart := _heat_chart(result, number):
+            yield Section(key=f"heat-{number}", title=f"Value against heat{where}", charts=(chart,))
+        key, title = f"figures-{number}", f"All figures{where}"
+        if not result.figures:
+            yield Section(key=key, title=title, failed=f"the baseline {label(result.baseline)} failed.")
+            continue
+        about = f"{result.scenario}, {result.unit}. Mean and paired difference to {label(result.baseline)}; {LEGEND}."
+        settings = f"Channel: {result.channel_text}. Randomisation: {result.randomise.text}."
+        scope, *groups = result.table.split()
+        sentences = (f"{about} {settings}", *result.table.notes)
+        yield Section(key=key, title=title, sentences=sentences, details=(*groups, scope))
     failures = [each for result in judged.results for each in result.failures]
-    content = {
-        "verdict": verdict(judged),
-        "scores": score_table(judged.scores) if judged.scores else None,
-        "remarks": judged.scores.remarks if judged.scores else (),
-        "baseline": label(judged.baseline),
-        "legend": LEGEND,
-        "by_cell": _cell_table(judged),
-        "charts": {chart.key: chart for chart in charts},
-        "figures": [_figures(result) for result in judged.results],
-        "several": len(judged.results) > 1,
-        "failures": [(_failure_text(each), each.trace) for each in failures[:MOST_FAILURES]],
-        "more_failures": max(0, len(failures) - MOST_FAILURES),
-        "illegal": _illegal(judged.results) or "No illegal action.",
-        "command": judged.command,
-        "card": _card_table(judged.card),
-        "hashes": Table(head=("", ""), rows=tuple(judged.card["instances"].items()), numbers=False),
-    }
-    return Page(title=judged.title, template="comparison.html", content=content, charts=charts, narrow=True).html()
+    sentences = [_illegal(judged.results) or "No illegal action.", *(["No policy failed."] if not failures else [])]
+    if len(failures) > MOST_FAILURES:
+        sentences.append(f"{len(failures) - MOST_FAILURES} more are in results.parquet.")
+    traces = tuple((f"{label(each.policy)}, {_failure_text(each)}", each.trace) for each in failures[:MOST_FAILURES])
+    yield Section(key="failures", title="Failures and illegal actions", sentences=tuple(sentences), details=traces)
+    hashes = [f"{digest}  {name}" for name, digest in judged.card["instances"].items()]
+    about = "Every shift is a row of results.parquet beside this page; study.json has these hashes."
+    details = ((f"Hashes of {len(hashes)} scenarios", "\n".join(hashes)),)
+    yield Section(key="rows", title="How to repeat", sentences=(judged.command, about), details=details)
 
 
 def verdict(judged: Judged) -> list[str]:
@@ -270,38 +276,22 @@ def _cell_table(judged: Judged) -> Table | None:
     return Table(head=head, rows=rows)
 
 
-def _heat_charts(judged: Judged) -> Iterator[Chart]:
-    """Value against heat, one chart for each result."""
-    for number, result in enumerate(judged.results):
-        figures = {label(name): (each["peak_c"], each["value"]) for name, each in result.figures.items()}
-        rows = [(name, (x.mean, x.low, x.high), (y.mean, y.low, y.high)) for name, (x, y) in figures.items()]
-        if rows:
-            drawn = points(rows, "hottest motor, °C, mean over shifts", "value of finished jobs, mean over shifts")
-            alt = f"value of finished jobs against the hottest motor of {', '.join(figures)}"
-            yield Chart(key=f"heat_{number}", figure=drawn, alt=alt)
-
-
-def _figures(result: Comparison) -> dict[str, object]:
-    """Every figure of every policy, with the difference to the baseline, the best reward first."""
-    about = f"{result.scenario}, {result.unit}. Mean and paired difference to {label(result.baseline)}"
-    settings = f"Channel: {result.channel_text}. Randomisation: {result.randomise.text}."
-    table = result.table
-    return {
-        "scenario": result.scenario,
-        "baseline": label(result.baseline),
-        "about": f"{about}; {LEGEND}. {settings}",
-        "groups": list(table.split()) if result.figures else [],
-        "notes": table.notes,
-    }
+def _heat_chart(result: Comparison, number: int) -> Chart | None:
+    """Value against heat; None without figures."""
+    figures = {label(name): (each["peak_c"], each["value"]) for name, each in result.figures.items()}
+    rows = [(name, (x.mean, x.low, x.high), (y.mean, y.low, y.high)) for name, (x, y) in figures.items()]
+    drawn = points(rows, "hottest motor, °C, mean over shifts", "value of finished jobs, mean over shifts")
+    alt = f"value of finished jobs against the hottest motor of {', '.join(figures)}"
+    return Chart(key=f"heat_{number}", figure=drawn, alt=alt) if rows else None
 
 
 def _failure_text(each: Failed) -> str:
-    where = f"{label(each.policy)}, {each.instance}, fleet {each.fleet}, training {each.training}, seed {each.seed}"
-    return f"{where}: {each.error}"
+    return f"{each.instance}, fleet {each.fleet}, training {each.training}, seed {each.seed}: {each.error}"
 
 
-def _card_table(card: Mapping[str, Any]) -> Table:
+def _origin(judged: Judged) -> Table:
     """Code, versions, settings and policies of a study."""
+    card = judged.card
     rows = [("code", str(card["code_hash"])), *((f"version of {k}", str(v)) for k, v in card["versions"].items())]
     rows += [(name, value_text(card[name])) for name in ("risk", "channel", "randomise", "decision_limit_s")]
     for name, digest in card["policies"].items():
@@ -333,9 +323,9 @@ def spans(rows: Sequence[tuple[str, float, float, float]], title: str, *, least:
     return {
         "data": [_dots(values, at, names, {"marker": {"color": COLOURS[0], "size": 9}})],
         "layout": LAYOUT
-        | {"height": MARGIN["t"] + ROW_PX * len(rows) + MARGIN["b"], "margin": MARGIN}
+        | {"height": 12 + ROW_PX * len(rows) + MARGIN["b"], "margin": MARGIN | {"t": 12}}
         | {"annotations": cut, "showlegend": False}
-        | {"xaxis": axis(title, range=[low - room, high + room]), "yaxis": named_rows(labels)},
+        | {"xaxis": axis(title, range=[low - room, high + room]), "yaxis": charts.named_rows(labels)},
     }
 
 
@@ -353,21 +343,14 @@ def lines(
         by_name: Value, low and high of each curve, [point].
         banded: Curves whose low and high are shown.
     """
-    x = x_values.round(4).tolist()
-    bands, curves = list[dict[str, Any]](), list[dict[str, Any]]()
+    bands, curves = list[Trace](), list[Trace]()
     for n, (name, (value, low, high)) in enumerate(by_name.items()):
-        colour, dash = COLOURS[n % len(COLOURS)], DASHES[n // len(COLOURS) % len(DASHES)]
         if name in banded:
-            around = {"x": [*x, *x[::-1]], "y": [*high.round(4).tolist(), *low.round(4).tolist()[::-1]]}
-            look = {"fill": "toself", "fillcolor": colour, "opacity": 0.12, "line": {"width": 0}, "hoverinfo": "skip"}
-            bands.append({"type": "scatter", "mode": "lines", "showlegend": False, **around, **look})
-        line = {"color": colour, "width": 2, "dash": dash}
-        curve = {"x": x, "y": value.round(4).tolist(), "line": line}
-        curves.append({"type": "scatter", "mode": "lines", "name": plain(name, NAME), **curve})
-    return {
-        "data": [*bands, *curves],
-        "layout": WITH_LEGEND | {"xaxis": axis(x_title, range=[x[0], x[-1]]), "yaxis": axis(y_title, range=[0, 1.02])},
-    }
+            bands.append(charts.band(x_values, low, high, charts.look_of(n)["color"], showlegend=False))
+        curves.append(charts.curve(plain(name, NAME), x_values, value, charts.look_of(n)))
+    ends = {"range": x_values[[0, -1]].tolist()}
+    axes = {"xaxis": axis(x_title, **ends), "yaxis": axis(y_title, range=[0, 1.02])}
+    return {"data": [*bands, *curves], "layout": charts.WITH_LEGEND | axes}
 
 
 def points(rows: Sequence[tuple[str, Range, Range]], x_title: str, y_title: str) -> Figure:
@@ -376,20 +359,20 @@ def points(rows: Sequence[tuple[str, Range, Range]], x_title: str, y_title: str)
     Args:
         rows: Name, x and y; each of the two with its lower and upper bound.
     """
-    data = list[dict[str, Any]]()
+    data = list[Trace]()
     for n, (name, x, y) in enumerate(rows):
         marker = {"color": COLOURS[n % len(COLOURS)], "symbol": SYMBOLS[n // len(COLOURS) % len(SYMBOLS)], "size": 9}
         data.append(_dots(np.array([x]), np.array([y]), [name], {"name": plain(name, NAME), "marker": marker}))
-    return {"data": data, "layout": WITH_LEGEND | {"xaxis": axis(x_title), "yaxis": axis(y_title)}}
+    return {"data": data, "layout": charts.WITH_LEGEND | {"xaxis": axis(x_title), "yaxis": axis(y_title)}}
 
 
-def _dots(x: Array, y: Array, names: Sequence[str], look: dict[str, Any]) -> dict[str, Any]:
+def _dots(x: Array, y: Array, names: Sequence[str], look: Trace) -> Trace:
     """Markers with their intervals, and their names as hover texts.
 
     Args:
         x, y: Value, low and high of each point, [point, 3]; NaN for an unknown end.
     """
-    trace: dict[str, Any] = {"type": "scatter", "mode": "markers", "x": x[:, 0].tolist(), "y": y[:, 0].tolist()}
+    trace: Trace = {"type": "scatter", "mode": "markers", "x": x[:, 0].tolist(), "y": y[:, 0].tolist()}
     for name, values in (("x", x), ("y", y)):
         below, above = np.nan_to_num(np.abs(values[:, 1:] - values[:, :1]), posinf=0.0).T.tolist()
         bars = {"type": "data", "symmetric": False, "array": above, "arrayminus": below, "thickness": 1.5, "width": 0}

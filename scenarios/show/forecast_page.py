@@ -7,8 +7,8 @@ from typing import Any  # values of JSON and of Plotly's schema
 import numpy as np
 
 from fleet.robot import JOINTS, ThermalLimits
-from scenarios.show.comparison_page import COLOURS
-from scenarios.show.page import GRID, INK, LAYOUT, LEGEND_ABOVE, Chart, Section, axis, sections_page
+from scenarios.show import charts
+from scenarios.show.page import Chart, Page, Section, origin_table
 from scenarios.show.words import duration
 from scenarios.table import Column, Table
 from twin.logs.recording import Recording
@@ -24,49 +24,33 @@ MINUTE_S = 60.0
 
 
 def summary(found: ThermalForecast, so_far: Recording, repetitions: int) -> list[str]:
-    """What a forecast says, in sentences."""
+    """The hottest motor at the end, and the highest safe start, in sentences; `limit_table` has the rest."""
     low, middle, high = (each[-1] for each in found.interval())
-    hottest = int(middle.argmax())
-    warning_c, error_c = LIMITS_C[1:]
-    sentences = [
-        f"After {_times(repetitions)}, {duration(found.run_s)}, joint {hottest + 1} is the hottest: "
+    hottest, warning_c = int(middle.argmax()), ThermalLimits().warning_c
+    warmer_k = found.safe_start_k(warning_c)
+    times = "1 repetition" if repetitions == 1 else f"{repetitions} repetitions"
+    first = (
+        f"After {times}, {duration(found.run_s)}, joint {hottest + 1} is the hottest: "
         f"{middle[hottest]:.1f} °C (95 % interval {low[hottest]:.1f} to {high[hottest]:.1f}), now "
-        f"{so_far_c(so_far)[hottest]:.1f} °C.",
-        f"P(a motor reaches {warning_c:g} °C) {_p(found, warning_c)}; P({error_c:g} °C) {_p(found, error_c)}.",
-    ]
-    longest_s, warmer_k = found.longest_s(warning_c), found.safe_start_k(warning_c)
-    simulated = duration(float(found.time_s[-1]))
-    run = f"more than {simulated}" if math.isinf(longest_s) else "none, a motor is already there"
-    if 0 < longest_s < math.inf:
-        run = f"{duration(longest_s)}, {_times(int(longest_s / found.cycle_s))}"
-    sentences.append(f"Longest run in which P({warning_c:g} °C) is at most {100 * RISK:g} %: {run}.")
+        f"{so_far_c(so_far)[hottest]:.1f} °C."
+    )
     if math.isinf(warmer_k):
-        sentences.append(f"No start is safe: P({warning_c:g} °C) is higher even from an arm at {found.ambient_c:g} °C.")
-        return sentences
+        at = f"from an arm at {found.ambient_c:g} °C"
+        return [first, f"No start is safe: P({warning_c:g} °C) is more than {100 * RISK:g} % even {at}."]
     # Rounded down, so that it is below the limit.
     start_c = math.floor(10.0 * (float(so_far_c(so_far).max()) + warmer_k) - 1e-6) / 10.0
     than = f"{abs(warmer_k):.1f} K {'warmer' if warmer_k >= 0 else 'cooler'} than now"
-    sentences.append(
+    return [
+        first,
         f"Highest safe start of the planned run: hottest motor at {start_c:.1f} °C, if all motors and housings are "
-        f"{than}."
-    )
-    return sentences
+        f"{than}.",
+    ]
 
 
 def so_far_c(so_far: Recording) -> Array:
     """Last motor temperatures of a log, °C, [joint]."""
     assert so_far.temp_c is not None, "a forecast starts from temperatures"
     return so_far.temp_c[-1]
-
-
-def _p(found: ThermalForecast, limit_c: float) -> str:
-    """Probability of reaching a limit in the run: `= 0.12`, or `<` the least that the samples resolve."""
-    probability, least = found.probability(limit_c), 1.0 / SAMPLES
-    return f"< {least:g}" if probability < least else f"= {probability:.2f}"
-
-
-def _times(repetitions: int) -> str:
-    return "1 repetition" if repetitions == 1 else f"{repetitions} repetitions"
 
 
 def joint_table(found: ThermalForecast, so_far: Recording) -> Table:
@@ -87,33 +71,13 @@ def joint_table(found: ThermalForecast, so_far: Recording) -> Table:
     return Table(head=head, rows=tuple(rows))
 
 
-def limit_table(found: ThermalForecast) -> Table:
-    """Probability and time of reaching each limit in the run, and the longest run below it."""
-    rows = []
-    for limit_c in LIMITS_C:
-        early_s, middle_s, _ = found.reached_s(limit_c)
-        longest_s = found.longest_s(limit_c)
-        rows.append(
-            (
-                f"{limit_c:g} °C",
-                _p(found, limit_c).removeprefix("= "),
-                *("–" if math.isinf(s) else duration(s) for s in (early_s, middle_s)),
-                f"> {duration(float(found.time_s[-1]))}" if math.isinf(longest_s) else duration(longest_s),
-            )
-        )
-    head = ("limit", "P in the run", Column("earliest", words=True), Column("median", words=True), "longest run")
-    note = f"Earliest: {100 * RISK:g} % quantile. Longest run: P(reaching the limit) is at most {100 * RISK:g} %."
-    return Table(head=head, rows=tuple(rows), notes=(note,))
-
-
-def card(found: ThermalForecast, so_far: Recording, origin: Mapping[str, str]) -> dict[str, Any]:
-    """The numbers of a forecast as JSON, and from what they were made."""
-    low, middle, high = found.interval()
+def limits(found: ThermalForecast) -> list[dict[str, Any]]:
+    """Probability and times of reaching each limit in the run, and what is safe; None where it is never reached."""
 
     def finite(value: float) -> float | None:
         return None if math.isinf(value) else value
 
-    limits = [
+    return [
         {
             "limit_c": limit_c,
             "p": found.probability(limit_c),
@@ -123,13 +87,35 @@ def card(found: ThermalForecast, so_far: Recording, origin: Mapping[str, str]) -
         }
         for limit_c in LIMITS_C
     ]
+
+
+def limit_table(found: ThermalForecast) -> Table:
+    """Probability and time of reaching each limit in the run, and the longest run below it."""
+    least, simulated = 1.0 / SAMPLES, f"> {duration(float(found.time_s[-1]))}"
+    rows = [
+        (
+            f"{each['limit_c']:g} °C",
+            f"< {least:g}" if each["p"] < least else f"{each['p']:.2f}",
+            *("–" if (s := each["reached_s"][name]) is None else duration(s) for name in ("early", "median")),
+            simulated if each["longest_s"] is None else duration(each["longest_s"]),
+        )
+        for each in limits(found)
+    ]
+    head = ("limit", "P in the run", Column("earliest", words=True), Column("median", words=True), "longest run")
+    note = f"Earliest: {100 * RISK:g} % quantile. Longest run: P(reaching the limit) is at most {100 * RISK:g} %."
+    return Table(head=head, rows=tuple(rows), notes=(note,))
+
+
+def card(found: ThermalForecast, so_far: Recording, origin: Mapping[str, str]) -> dict[str, Any]:
+    """The numbers of a forecast as JSON, and from what they were made."""
+    low, middle, high = found.interval()
     courses = {"low_c": low, "median_c": middle, "high_c": high}
     return {
         "origin": dict(origin),
         "run_s": found.run_s,
         "cycle_s": found.cycle_s,
         "now_c": so_far_c(so_far).tolist(),
-        "limits": limits,
+        "limits": limits(found),
         "time_s": found.time_s[found.in_run].tolist(),
         **{name: np.round(values, 3).tolist() for name, values in courses.items()},
     }
@@ -146,7 +132,8 @@ def page(found: ThermalForecast, so_far: Recording, repetitions: int, origin: Ma
         charts=(_chart(found, so_far),),
         tables=(limit_table(found), joint_table(found, so_far)),
     )
-    return sections_page(f"Thermal forecast after {so_far.name}", [section], origin)
+    title = f"Thermal forecast after {so_far.name}"
+    return Page(title=title, sections=[section], origin=origin_table(origin)).html()
 
 
 def _chart(found: ThermalForecast, so_far: Recording) -> Chart:
@@ -154,52 +141,32 @@ def _chart(found: ThermalForecast, so_far: Recording) -> Chart:
     low, middle, high = found.interval()
     hottest = int(middle[-1].argmax())
     measured = so_far.part(so_far.time_s >= so_far.time_s[-1] - max(found.run_s, 30 * MINUTE_S))
-    before = np.unique(np.linspace(0, len(measured.time_s) - 1, MOST_POINTS).round().astype(int))
-    after = np.unique(np.linspace(0, len(middle) - 1, MOST_POINTS).round().astype(int))
-    past = (measured.time_s[before] - so_far.time_s[-1]) / MINUTE_S
-    ahead = found.time_s[found.in_run][after] / MINUTE_S
     assert measured.temp_c is not None, "a forecast starts from temperatures"
-    band = {
-        "type": "scatter",
-        "x": [*ahead.tolist(), *ahead[::-1].tolist()],
-        "y": [*high[after, hottest].tolist(), *low[after, hottest][::-1].tolist()],
-        "fill": "toself",
-        "fillcolor": f"{COLOURS[hottest]}33",
-        "line": {"width": 0},
-        "hoverinfo": "skip",
-        "name": f"95 % interval of joint {hottest + 1}",
+    ahead = found.time_s[found.in_run] / MINUTE_S
+    minutes = np.append((measured.time_s - so_far.time_s[-1]) / MINUTE_S, ahead)
+    temp_c = np.concatenate([measured.temp_c, middle])
+    name, colour = f"95 % interval of joint {hottest + 1}", charts.JOINT_LINES[hottest][0]
+    data = [charts.band(ahead, low[:, hottest], high[:, hottest], colour, name=name)]
+    for j, (colour, dash) in enumerate(charts.JOINT_LINES):
+        look = {"color": colour, "dash": dash, "width": 2.5 if j == hottest else 1.3}
+        data.append(charts.curve(f"joint {j + 1}", minutes, temp_c[:, j], look, most=MOST_POINTS))
+    lines, labels = charts.limit_lines(ThermalLimits())
+    now = {
+        "type": "line",
+        "x0": 0,
+        "x1": 0,
+        "yref": "paper",
+        "y0": 0,
+        "y1": 1,
+        "line": {"color": charts.INK, "width": 1},
     }
-    lines = [
-        {
-            "type": "scatter",
-            "mode": "lines",
-            "name": f"joint {j + 1}",
-            "x": [*past.tolist(), *ahead.tolist()],
-            "y": np.round([*measured.temp_c[before, j], *middle[after, j]], 2).tolist(),
-            "line": {"color": COLOURS[j], "width": 2.5 if j == hottest else 1.3},
-        }
-        for j in range(JOINTS)
-    ]
-    most_c = max(float(high.max()), float(measured.temp_c.max()))
-    shown_c = [limit_c for limit_c in LIMITS_C[1:] if limit_c < most_c + 15.0]
-    layout = LAYOUT | {
-        "height": 430,
-        "margin": {"l": 55, "r": 15, "t": 60, "b": 50},
-        "legend": LEGEND_ABOVE,
-        "xaxis": axis("minutes from the end of the log"),
-        "yaxis": axis("motor temperature, °C"),
-        "shapes": [*(_rule("x", "y", c, "#b00020") for c in shown_c), _rule("y", "x", 0.0, GRID)],
-        "annotations": [
-            {"xref": "paper", "x": 1, "xanchor": "right", "y": c, "yanchor": "bottom", "showarrow": False}
-            | {"text": f"{c:g} °C", "font": {"color": INK}}
-            for c in shown_c
-        ],
+    shown_c = charts.range_c(np.concatenate([measured.temp_c, high]), ThermalLimits())
+    layout = charts.WITH_LEGEND | {
+        "margin": charts.MARGIN | {"r": charts.LIMITS_PX, "t": 60},
+        "xaxis": charts.axis("minutes from the end of the log"),
+        "yaxis": charts.axis("motor temperature, °C", range=shown_c),
+        "shapes": [*lines, now],
+        "annotations": labels,
     }
     alt = f"Motor temperatures before and in the run; joint {hottest + 1} ends at {middle[-1, hottest]:.1f} °C"
-    return Chart(key="forecast_chart", figure={"data": [band, *lines], "layout": layout}, alt=alt)
-
-
-def _rule(across: str, axis: str, value: float, colour: str) -> dict[str, Any]:
-    """A straight line through the whole chart at a value of an axis."""
-    ends = {f"{across}ref": "paper", f"{across}0": 0, f"{across}1": 1, f"{axis}0": value, f"{axis}1": value}
-    return {"type": "line", "line": {"color": colour, "dash": "dash", "width": 1.3}, **ends}
+    return Chart(key="forecast_chart", figure={"data": data, "layout": layout}, alt=alt)

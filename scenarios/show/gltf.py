@@ -27,9 +27,6 @@ Array = np.ndarray
 
 BAND_K = 5.0
 """Width of a band of temperatures with one colour and one radius."""
-SAME_RAD = 2e-5
-"""A joint angle is left out where interpolation between its neighbours gives it this well: less than 0.1 mm at the tool
-point of a stretched arm."""
 LONGEST_TURN_RAD = 2.0
 """Largest turn of a joint between two keys: a turn of more than π would go the other way round."""
 Z_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
@@ -153,8 +150,9 @@ class _GltfFile:
     def _turn(self, node: int, link: int, joint: int, angle_rad: Array) -> None:
         """Animate the rotation of a link by its joint's angles [moment]."""
         time_s, angle_rad = divided(self.pose_s, angle_rad)
-        kept = keys_of(time_s, angle_rad)
-        q = np.zeros((len(kept), JOINTS))
+        turns = np.diff(angle_rad) != 0
+        kept = np.append(True, turns) | np.append(turns, True)  # a resting joint needs its first and last moment only
+        q = np.zeros((kept.sum(), JOINTS))
         q[:, joint] = angle_rad[kept]
         rotations = self.moments.link_quaternions(q)[:, link][:, [1, 2, 3, 0]]
         rotations /= np.linalg.norm(rotations, axis=1, keepdims=True)
@@ -244,28 +242,6 @@ def divided(time_s: Array, angle_rad: Array) -> tuple[Array, Array]:
     within = [np.linspace(a, b, n, endpoint=False) for a, b, n in ends_s]
     finer_s = np.concatenate([*within, time_s[-1:]])
     return finer_s, np.interp(finer_s, time_s, angle_rad)
-
-
-def keys_of(time_s: Array, angle_rad: Array, same_rad: float = SAME_RAD) -> Array:
-    """Moments that reproduce an angle by linear interpolation to within `same_rad`, the first and the last among them.
-
-    A line from the last key has to pass every later moment within the tolerance (swinging door compression: Bristol,
-    ISA Transactions 1990).
-
-    Args:
-        time_s, angle_rad: [moment].
-    """
-    times, angles = time_s.tolist(), angle_rad.tolist()
-    kept, low, high = [0], -np.inf, np.inf
-    for i in range(1, len(times)):
-        run_s, rise = times[i] - times[kept[-1]], angles[i] - angles[kept[-1]]
-        if not low <= rise / run_s <= high or (abs(rise) > LONGEST_TURN_RAD and i - 1 > kept[-1]):
-            kept.append(i - 1)
-            run_s, rise, low, high = times[i] - times[i - 1], angles[i] - angles[i - 1], -np.inf, np.inf
-        low, high = max(low, (rise - same_rad) / run_s), min(high, (rise + same_rad) / run_s)
-    if len(times) > 1:
-        kept.append(len(times) - 1)
-    return np.array(kept)
 
 
 class Buffer:

@@ -14,7 +14,7 @@ from fleet.job import payload_radius_m
 from fleet.robot import ThermalLimits
 from scenarios.run.log import RunLog
 from scenarios.show.page import HEAT_STEP_S
-from scenarios.show.words import SEVERITY, event_text, offer_text
+from scenarios.show.words import SEVERITY, event_text, offers_text
 
 Array = np.ndarray
 
@@ -105,8 +105,7 @@ class Moments:
             yield LogLine(event.time_s, SEVERITY.get(event.kind, "info"), event.arm, event_text(event))
             if event.kind == "award" and (made := offers.get((event.time_s, event.job))):
                 made.sort(key=lambda offer: (not offer.awarded, offer.arm))
-                of_arms = "; ".join(f"{offer.arm}: {offer_text(offer)}" for offer in made)
-                yield LogLine(event.time_s, "info", "", f"offers for {event.job}: {of_arms}")
+                yield LogLine(event.time_s, "info", "", f"offers for {event.job}: {offers_text(made)}")
 
 
 def ahead(pose: Mapping[str, Any], distance_m: float) -> list[float]:

@@ -2,30 +2,26 @@
 
 import base64
 import gzip
-import html
-import io
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from importlib.util import find_spec
-from itertools import chain
 from pathlib import Path
-from typing import Any  # values of JSON
+from typing import Any, NamedTuple  # Any: values of JSON
 from zipfile import ZipFile
 
 import numpy as np
 from markupsafe import Markup
 
-from fleet.errors import FleetError, install, visible
+from fleet.errors import FleetError, install
 from fleet.telemetry import Telemetry
-from scenarios.table import Table, render, static
+from scenarios.show.charts import Figure
+from scenarios.table import Moment, Table, render, static
 
 Array = np.ndarray
-Figure = Mapping[str, Any]
-"""`data` and `layout` in Plotly's schema: a plain dict, because Plotly's own objects take longer than a report."""
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data: blob:; form-action 'none'; base-uri 'none'"
 """The browser itself prevents every request."""
@@ -37,37 +33,6 @@ _PLOTLY_OPTIONS = {
     "showSendToCloud": False,
     "plotlyServerURL": "",
 }
-INK, GRID, FRAME = "#222222", "#e6e6e6", "#bbbbbb"
-LAYOUT = {
-    "template": "none",
-    "font": {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 12, "color": INK},
-    "paper_bgcolor": "white",
-    "plot_bgcolor": "white",
-    "hovermode": "closest",
-    "hoverlabel": {"align": "left", "bgcolor": "white", "bordercolor": FRAME, "font": {"color": INK}},
-}
-"""Of every figure; a dark page changes its colours."""
-AXIS = {"showgrid": True, "gridcolor": GRID, "zeroline": False, "linecolor": FRAME, "ticks": "outside"}
-LEGEND_ABOVE = {"orientation": "h", "x": 0, "y": 1.02, "xanchor": "left", "yanchor": "bottom"}
-
-
-def axis(title: str, **more: Any) -> dict[str, Any]:
-    """An axis with a title; `more` in Plotly's schema."""
-    return AXIS | {"title": {"text": title}} | more
-
-
-def named_rows(names: Sequence[str], **more: Any) -> dict[str, Any]:
-    """A y axis of rows with names, the first at the top; `more` in Plotly's schema."""
-    ticks = {"tickvals": list(range(len(names))), "ticktext": list(names), "range": [len(names) - 0.5, -0.5]}
-    return AXIS | ticks | {"automargin": True, "showgrid": False} | more
-
-
-def plain(text: str, most: int | None = None) -> str:
-    """Text escaped for Plotly, which interprets some HTML and `%{…}`; with `most`, its start and end are kept."""
-    shown = visible(text)
-    if most is not None and len(shown) > most:
-        shown = f"{shown[: most - most // 2 - 1]}…{shown[-(most // 2) :]}"
-    return html.escape(shown, quote=False).replace("%{", "%&#123;")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -93,6 +58,10 @@ class Section:
     """Method."""
     charts: tuple[Chart, ...] = ()
     tables: tuple[Table, ...] = ()
+    html: str = ""
+    """Further content, as Markup."""
+    details: tuple[tuple[str, Table | str], ...] = ()
+    """Headings, and what a click on each shows: a table, HTML, or text as it is."""
     numbers: Mapping[str, Any] = field(default_factory=dict)  # plain values for report.json
     failed: str | None = None
     """Why there is no result; None for a complete section."""
@@ -121,29 +90,67 @@ class Playback:
         return {"ms": 1000 * moment.timestamp(), "zone": zone or "UTC"}
 
 
+class Badge(NamedTuple):
+    """An outcome in a few words."""
+
+    text: str
+    good: bool
+    moment: Moment | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Head:
+    """What a page has above its sections."""
+
+    badges: Sequence[Badge] = ()
+    sentences: Sequence[str] = ()
+    moments: Mapping[str, Moment] = field(default_factory=dict)
+    """Of some of the sentences."""
+    remarks: Sequence[str] = ()
+    tiles: Sequence[tuple[str, str, str]] = ()
+    """Key figures: name, text and style."""
+    replay: Playback | None = None
+    names: Sequence[str] = ("",)
+    """Of the shifts of the replay."""
+    links: Mapping[str, str] = field(default_factory=dict)
+    """Addresses of reports by name."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Page:
-    """A page: a template, what it shows, and the figures and the replay whose places are in the template."""
+    """A page of sections, with the figures and the replay inside."""
 
     title: str
-    template: str
-    content: Mapping[str, object]
-    """Values of the template."""
-    charts: Sequence[Chart] = ()
-    replay: Playback | None = None
+    sections: Sequence[Section]
+    head: Head = field(default_factory=Head)
+    origin: Table | None = None
+    """From what its figures come."""
+    narrow: bool = True
+    """For text, with links to the sections; otherwise for figures over a shift."""
     plan: Mapping[str, Any] | None = None
     """Cell that `layout.js` draws; Any: values of JSON."""
-    narrow: bool = False
-    """For text; the default width is for figures over a shift."""
 
     def html(self) -> str:
         """The whole file; the same page gives the same text."""
         data = self._data()
-        policy = f"script-src 'unsafe-inline'; {_POLICY}" if data else _POLICY
-        head = {"title": self.title, "narrow": self.narrow, "policy": policy, "css": Markup(static("page.css"))}
-        texts = {key: Markup(text) for key, text in data.items()}
-        code = Markup(self._code()) if data else ""
-        return str(render(self.template, **self.content, **head, data=texts, code=code))
+        values = {
+            "title": self.title,
+            "sections": self.sections,
+            "head": self.head,
+            "origin": self.origin,
+            "narrow": self.narrow,
+            "failed": [each.title for each in self.sections if each.failed],
+            "policy": f"script-src 'unsafe-inline'; {_POLICY}" if data else _POLICY,
+            "css": Markup(static("page.css")),
+            "data": {key: Markup(text) for key, text in data.items()},
+            "code": Markup(self._code()) if data else "",
+        }
+        return str(render("page.html", **values)).lstrip()
+
+    @property
+    def charts(self) -> list[Chart]:
+        """Of all sections."""
+        return [chart for each in self.sections for chart in each.charts]
 
     def _data(self) -> dict[str, str]:
         """What scripts read, by the id of the element that holds it."""
@@ -153,53 +160,41 @@ class Page:
             data |= {chart.key: _json(chart.figure) for chart in self.charts}
         if self.plan:
             data["layout"] = _json(self.plan)
-        if self.replay:
-            data |= {"three": _packed_three_js(), "cell-model": _json(self.replay.model)}
-            data |= {f"playback-{number}": shift for number, shift in enumerate(self.replay.shifts)}
+        if self.head.replay:
+            data |= {"three": _packed_three_js(), "cell-model": _json(self.head.replay.model)}
+            data |= {f"playback-{number}": shift for number, shift in enumerate(self.head.replay.shifts)}
         return data
 
     def _code(self) -> str:
         """The scripts, and the function that begins; the replay comes first, since a figure takes longer."""
-        replay = self.replay
+        replay = self.head.replay
         code = [static(name) for name in ("unpack.js", "figure.js", *(("cell.js", "replay.js") if replay else ()))]
         code += [static("layout.js")] if self.plan else []
         begin = f"startReplay({replay.unit_s},{json.dumps(replay.clock)})" if replay else ""
         play = f'await runLibrary("three");const shift=await {begin};' if replay else ""
-        draw = f"const figure=await drawFigures({json.dumps(_PLOTLY_OPTIONS)});" if self.charts else ""
-        join = "shift.attach(figure);" if replay and self.charts else ""
+        draw = f"const figures=await drawFigures({json.dumps(_PLOTLY_OPTIONS)});" if self.charts else ""
+        join = "shift.attach(figures);" if replay and self.charts else ""
         plan = "startLayout();" if self.plan else ""
         start = f'async function start(){{startFilters();{plan}{play}{draw}{join}document.body.dataset.ready="all";}}'
         failed = "start().catch((error)=>{document.title+=' (incomplete)';console.error(error);});"
         return f"{''.join(code)}\n{start}\n{failed}"
 
 
-def sections_page(
-    title: str, sections: Sequence[Section], origin: Table | Mapping[str, str], lead: Sequence[str] = ()
-) -> str:
-    """A page of sections as HTML text, which opens offline; the same input gives the same text.
-
-    Args:
-        origin: From what its figures come.
-        lead: First sentences.
-    """
-    if not isinstance(origin, Table):
-        origin = Table(head=("", ""), rows=tuple(origin.items()), numbers=False)
-    failed = [each.title for each in sections if each.failed]
-    charts = [chart for each in sections for chart in each.charts]
-    content = {"lead": lead, "sections": sections, "failed": failed, "origin": origin}
-    return Page(title=title, template="sections.html", content=content, charts=charts, narrow=True).html()
+def origin_table(origin: Mapping[str, str]) -> Table:
+    """From what the figures of a page come, by name."""
+    return Table(head=("", ""), rows=tuple(origin.items()), numbers=False)
 
 
 @cache
 def _plotly_js() -> str:
     from plotly.offline import get_plotlyjs
 
-    return compressed([get_plotlyjs().encode()])
+    return compressed(get_plotlyjs().encode())
 
 
 @cache
 def _packed_three_js() -> str:
-    return compressed([three_js().encode()])
+    return compressed(three_js().encode())
 
 
 def _json(value: object) -> str:
@@ -255,35 +250,26 @@ def packed(telemetry: Telemetry, payload_kg: Array | None = None) -> str:
         for name, values, scale, stride in arrays
     ]
 
-    def body() -> Iterator[bytes]:
-        for _, values, scale, stride in arrays:
-            for arm in range(arms):  # one at a time, as large fleets have much
-                steps = np.clip(np.round(_filled(values[::stride, arm]) / scale), -(2**15), 2**15 - 1)
-                yield np.diff(steps.astype(np.int32).T, axis=-1, prepend=0).astype("<i2").tobytes()
+    parts = [json.dumps(listed, separators=(",", ":")).encode() + b"\n"]
+    for _, values, scale, stride in arrays:
+        for arm in range(arms):  # one at a time, as large fleets have much
+            steps = np.clip(np.round(_filled(values[::stride, arm]) / scale), -(2**15), 2**15 - 1)
+            parts.append(np.diff(steps.astype(np.int32).T, axis=-1, prepend=0).astype("<i2").tobytes())
+    return compressed(b"".join(parts))
 
-    return compressed(chain([json.dumps(listed, separators=(",", ":")).encode() + b"\n"], body()))
 
-
-def compressed(content: Iterable[bytes]) -> str:
-    """Bytes, in pieces, as base64 of a gzip stream; the same content gives the same text."""
-    packed = io.BytesIO()
-    with gzip.GzipFile(fileobj=packed, mode="wb", compresslevel=9, mtime=0) as file:
-        for piece in content:
-            file.write(piece)
-    return base64.b64encode(packed.getbuffer()).decode("ascii")
+def compressed(content: bytes) -> str:
+    """Bytes as base64 of a gzip stream; the same content gives the same text."""
+    return base64.b64encode(gzip.compress(content, 9, mtime=0)).decode("ascii")
 
 
 def _filled(values: Array) -> Array:
     """Values along the first axis, NaN replaced by the last value before it, or the first after it."""
-    values = np.array(values, dtype=float)
-    if np.isfinite(values).all():
-        return values
-    flat = values.reshape(len(values), -1)
-    for column in flat.T:
-        known = np.flatnonzero(np.isfinite(column))
-        last = np.searchsorted(known, np.arange(len(column)), side="right") - 1
-        column[:] = column[known[np.maximum(last, 0)]] if len(known) else 0.0
-    return flat.reshape(values.shape)
+    known = np.isfinite(values)
+    at = np.arange(len(values)).reshape(-1, *[1] * (values.ndim - 1))
+    last = np.maximum.accumulate(np.where(known, at, 0))
+    last = np.where(np.logical_or.accumulate(known), last, known.argmax(axis=0))
+    return np.nan_to_num(np.take_along_axis(values, last, axis=0))
 
 
 def three_js() -> str:

@@ -15,10 +15,11 @@ from matplotlib.patches import Circle, Polygon
 from fleet.arm.kinematics import FOREARM_M, HAND_M, REACH_M, UPPER_ARM_M
 from fleet.env.render.picture import FAULT, INK, outlines
 from fleet.env.render.scene import mount_kind
-from scenarios.show.comparison_page import COLOURS
+from scenarios.show.charts import COLOURS
 from scenarios.show.layout import LayoutReport, shoulder_m
-from scenarios.show.page import Page
+from scenarios.show.page import Badge, Head, Page, Section
 from scenarios.spec.schema import Scenario
+from scenarios.table import render
 
 Array = np.ndarray
 MOST_NAMED, MOST_NUMBERS, MOST_ROWS = 16, 24, 40
@@ -73,8 +74,10 @@ def plan_page(scenario: Scenario, report: LayoutReport) -> str:
         "places": [{"name": place.name, "at": place.position_m} for place in scenario.places],
         "fixtures": [outline.tolist() for fixture in scenario.fixtures for outline in outlines(fixture)],
     }
-    content = {"legend": f"The {LEGEND.format(height_m)}.", "problems": report.problems}
-    return Page(title=f"Plan of {scenario.name}", template="layout.html", content=content, plan=plan).html()
+    drag = "Drag an arm by its base, or turn it by the tip of its arrow; with the arrow keys it moves by 1 cm."
+    head = Head(remarks=(f"{drag} The {LEGEND.format(height_m)}.",), badges=[Badge(problem, good=False) for problem in report.problems])
+    cell = Section(key="cell", title="Cell", html=render("layout.html"))
+    return Page(title=f"Plan of {scenario.name}", sections=[cell], head=head, plan=plan, narrow=False).html()
 
 
 def _height_m(scenario: Scenario) -> float:

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from statistics import median
@@ -14,19 +14,10 @@ import numpy as np
 from fleet.env.render.heat import heat_scale
 from fleet.events import Event
 from scenarios.run.records import JobSpan, Offer, ShiftLog
-from scenarios.show.page import (
-    AXIS,
-    LAYOUT,
-    Chart,
-    Figure,
-    Page,
-    Playback,
-    named_rows,
-    packed,
-    plain,
-)
-from scenarios.show.timeline import POLICY_LINES, STREAM_NAME, figure, hottest_motors, stream_of, time_unit
-from scenarios.show.words import clock, duration, kind_text, names_text, offer_text, value_text
+from scenarios.show.charts import AXIS, COLOURS, LAYOUT, Figure, named_rows, plain
+from scenarios.show.page import Badge, Chart, Head, Page, Playback, Section, packed
+from scenarios.show.timeline import STREAM_NAME, hottest_motors, shift_charts, stream_of, time_unit
+from scenarios.show.words import clock, duration, kind_text, names_text, offer_text, offers_text, value_text
 from scenarios.table import Column, Moment, Table, render
 
 MOST_FAULTS = 2
@@ -300,7 +291,35 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
     most = max(waits_s, key=lambda why: waits_s[why])
     if not waits_s[most]:
         return f"what {names_text(able)} did meanwhile is not recorded"
-    return _passed(log, late, able, begin_s, end_s) if most == "" else f"{names_text(able)} {most}"
+    if most:
+        return f"{names_text(able)} {most}"
+    return _passed(log, late, able, begin_s, end_s)
+
+
+def _passed(log: ShiftLog, late: LateJob, able: Sequence[str], begin_s: float, end_s: float) -> str:
+    """How many jobs were awarded before a late one to arms that can do it, and what most of them have in common."""
+    ahead = [s for s in log.plan.assignments if s.arm in able and begin_s <= s.start_s < end_s and s.job != late.job]
+    records = {record.job: record for record in log.jobs}
+    took_s = {(o.arm, o.job, o.time_s): o.duration_s for o in log.offers if o.duration_s}
+    like = [s for (_, job, _), s in took_s.items() if job == late.job]
+    own = records.get(late.job)
+    if own is not None and not like:  # never awarded: by the time per cycle of jobs of its stream
+        alike = [(s, records[job]) for (_, job, _), s in took_s.items() if stream_of(job) == stream_of(late.job)]
+        like = [s / record.cycles * own.cycles for s, record in alike if record.cycles]
+    own_s = median(like) if like else 0.0
+    counts = dict.fromkeys(("shorter", "worth more", "due earlier", "worth more per minute"), 0)
+    for span in ahead:
+        span_s = took_s.get((span.arm, span.job, span.start_s), math.inf)
+        counts["shorter"] += span_s < own_s
+        if own is not None and (other := records.get(span.job)) is not None:
+            counts["worth more"] += other.value > own.value
+            counts["due earlier"] += other.due_s < own.due_s
+            counts["worth more per minute"] += other.value * own_s > own.value * span_s
+    most = max(counts, key=lambda trait: counts[trait])
+    share = "all" if counts[most] == len(ahead) else str(counts[most])
+    which = f", {share} of them {most}" if 2 * counts[most] > len(ahead) else ""
+    arms = [arm for arm in log.arms if any(span.arm == arm for span in ahead)]
+    return f"{len(ahead)} other job{'s' * (len(ahead) > 1)} went first on {names_text(arms)}{which}"
 
 
 def _arm_time(log: ShiftLog, able: Sequence[str], begin_s: float, end_s: float) -> dict[str, float]:
@@ -326,32 +345,6 @@ def _arm_time(log: ShiftLog, able: Sequence[str], begin_s: float, end_s: float) 
     return time_s
 
 
-def _passed(log: ShiftLog, late: LateJob, able: Sequence[str], begin_s: float, end_s: float) -> str:
-    """How many jobs were awarded before a late one to arms that can do it, and what most of them have in common."""
-    ahead = [a for a in log.plan.assignments if a.arm in able and begin_s <= a.start_s < end_s and a.job != late.job]
-    records = {record.job: record for record in log.jobs}
-    took_s = {(o.arm, o.job, o.time_s): o.duration_s for o in log.offers if o.duration_s}
-    like = [s for (_, job, _), s in took_s.items() if job == late.job]
-    own = records.get(late.job)
-    if own is not None and not like:  # never awarded: by the time per cycle of jobs of its stream
-        alike = [(s, records[job]) for (_, job, _), s in took_s.items() if stream_of(job) == stream_of(late.job)]
-        like = [s / record.cycles * own.cycles for s, record in alike if record.cycles]
-    own_s = median(like) if like else 0.0
-    counts = dict.fromkeys(("shorter", "worth more", "due earlier", "worth more per minute"), 0)
-    for span in ahead:
-        span_s = took_s.get((span.arm, span.job, span.start_s), math.inf)
-        counts["shorter"] += span_s < own_s
-        if own is not None and (other := records.get(span.job)) is not None:
-            counts["worth more"] += other.value > own.value
-            counts["due earlier"] += other.due_s < own.due_s
-            counts["worth more per minute"] += other.value * own_s > own.value * span_s
-    most = max(counts, key=lambda trait: counts[trait])
-    share = "all" if counts[most] == len(ahead) else str(counts[most])
-    which = f", {share} of them {most}" if 2 * counts[most] > len(ahead) else ""
-    arms = [arm for arm in log.arms if any(span.arm == arm for span in ahead)]
-    return f"{len(ahead)} other job{'s' * (len(ahead) > 1)} went first on {names_text(arms)}{which}"
-
-
 MOST_LATE = 50
 ROWS = 300
 """Most rows of the event table, and of the table of requests."""
@@ -371,19 +364,8 @@ NOTABLE = (
 )
 """Event kinds of the event table, most important first; the least important are dropped first."""
 MOST_AWARDS = 300
-MOST_ARMS = 8
-"""With more arms, the columns of an award are the best other offers instead of the arms."""
-
-
-@dataclass(frozen=True)
-class Tile:
-    """A key figure."""
-
-    label: str
-    number: str
-    small: str
-    """Unit, whole or arm beside the number."""
-    bad: bool
+MOST_OFFERS = 7
+"""Other offers that an award shows."""
 
 
 def report_html(log: ShiftLog, model: Mapping[str, Any] | None = None) -> str:
@@ -402,23 +384,28 @@ def report_html(log: ShiftLog, model: Mapping[str, Any] | None = None) -> str:
         replay = _playback([log], model)
     scenario = card.get("scenario", {})
     outcome = verdict(log)
-    content = {
-        "verdict": outcome,
-        "first": next(iter(outcome.moments.values()), None),
-        "description": str(scenario.get("description") or ""),
-        "how": " · ".join(_settings(card, log.arms)),
-        "tiles": key_figures(card.get("metrics") or {}),
-        "replay": replay is not None,
-        "late": _late_table(log),
-        "events": _event_table(log),
-        "awards": _award_table(log),
-        "requests": _request_table(card.get("requests") or ()),
-        "provenance": _provenance(card),
-    }
+    sections = [
+        Section(key=chart.key.replace("chart", "figure"), title=heading, charts=(chart,))
+        for heading, chart in shift_charts(log).items()
+    ]
+    if late := _late_table(log):
+        sections.append(Section(key="late", title="Late jobs", tables=(late,)))
+    sections += [_event_section(log), *_award_section(log)]
+    if requests := _request_table(card.get("requests") or ()):
+        sections.append(Section(key="requests", title="Requests of people", tables=(requests,)))
+    provenance = (("All settings and figures", _provenance(card).html()),)
+    sections.append(Section(key="provenance", title="Provenance", details=provenance))
     seed = f" · seed {card['seed']}" if "seed" in card else ""
+    head = Head(
+        badges=[Badge(outcome.badge, outcome.good, next(iter(outcome.moments.values()), None))],
+        sentences=outcome.sentences,
+        moments=outcome.moments,
+        remarks=[*filter(None, [scenario.get("description")]), " · ".join(_settings(card, log.arms))],
+        tiles=key_figures(card.get("metrics") or {}),
+        replay=replay,
+    )
     title = f"{scenario.get('name', 'unnamed scenario')} · {log.policy}{seed}"
-    chart = Chart(key="drawn", figure=figure(log), alt="Work and motor temperatures of each arm over the shift")
-    return Page(title=title, template="run.html", content=content, charts=(chart,), replay=replay).html()
+    return Page(title=title, sections=sections, head=head, narrow=False).html()
 
 
 def _playback(logs: Sequence[ShiftLog], model: Mapping[str, Any]) -> Playback:
@@ -477,26 +464,22 @@ KEY_FIGURES = (
     KeyFigure("insulation used", "most_insulation_ppb", ",.3g", "ppb"),
     KeyFigure("claims lost to another arm", "lost_claims", ",.0f"),
 )
-MAIN_FIGURES = tuple(
-    each
-    for each in KEY_FIGURES
-    if each.name in ("finished", "value", "on_time", "faults", "above_warning_min", "hottest_c")
-)
-"""Those by which shifts are compared."""
+MAIN_FIGURES = ("finished", "value", "on_time", "faults", "above_warning_min", "hottest_c")
+"""Metrics by which shifts are compared in a chart."""
 RARE = ("contacts", "given_up", "expired")
 """At the head of a report only where there are some."""
 
 
-def key_figures(metrics: Mapping[str, Any]) -> list[Tile]:
-    """The most important metrics; those without a number are left out."""
-    values, peaks = numbers(metrics), _peaks(metrics)
-    hottest = max(peaks, key=lambda arm: peaks[arm], default="")
-    tiles: list[Tile] = []
+def key_figures(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Name, text and style of the most important metrics; those without a number are left out."""
+    values, peaks_c = numbers(metrics), _peaks(metrics)
+    hottest = max(peaks_c, key=lambda arm: peaks_c[arm], default="")
+    tiles = list[tuple[str, str, str]]()
     for label, name, form, unit, whole in KEY_FIGURES:
         if name in values and (name not in RARE or values[name] > 0):
-            small = f" of {values[whole]:{form}}" if whole in values else f" {unit} {hottest * (name == 'hottest_c')}"
-            bad = name in ("faults", "contacts") and values[name] > 0
-            tiles.append(Tile(label, f"{values[name]:{form}}", small.rstrip(), bad))
+            small = f"of {values[whole]:{form}}" if whole in values else f"{unit} {hottest * (name == 'hottest_c')}"
+            bad = "bad" if name in ("faults", "contacts") and values[name] > 0 else ""
+            tiles.append((label, f"{values[name]:{form}} {small}".rstrip(), bad))
     return tiles
 
 
@@ -541,16 +524,19 @@ def numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
     return values | {name: max(by_arm.values()) for name, by_arm in own.items() if by_arm}
 
 
-def _event_table(log: ShiftLog) -> Mapping[str, object] | None:
-    """The notable events by time, how many there are, and which are left out; None if there are none."""
+def _event_section(log: ShiftLog) -> Section:
+    """The notable events by time, how many there are, and which are left out."""
     notable = [e for e in log.events if e.kind in NOTABLE]
     if not notable:
-        return None
+        return Section(key="log", title="Events", sentences=("No fault, no warning, no lost claim.",))
     first = sorted(notable, key=lambda e: (NOTABLE.index(e.kind), e.time_s))
     listed, rest = first[:ROWS], first[ROWS:]
-    counts = Counter(e.kind for e in notable)
-    omitted = _counted(Counter(e.kind for e in rest))
-    left_out = f"{len(listed)} of {len(notable)} are listed; left out: {omitted}. The event log has all of them."
+    sentences = [f"{_counted(Counter(e.kind for e in notable))}."]
+    if rest:
+        omitted = _counted(Counter(e.kind for e in rest))
+        sentences.append(
+            f"{len(listed)} of {len(notable)} are listed; left out: {omitted}. The event log has all of them."
+        )
     listed.sort(key=lambda e: (e.time_s, e.arm, NOTABLE.index(e.kind)))
     table = Table(
         head=("time", "event", "arm", "job", "reason"),
@@ -558,48 +544,35 @@ def _event_table(log: ShiftLog) -> Mapping[str, object] | None:
         numbers=False,
     )
     kinds, moments = [e.kind for e in listed], [_before(event) for event in listed]
-    return {
-        "counts": f"{_counted(counts)}.",
-        "omitted": left_out if rest else "",
-        "lost": bool(counts["lost"]),  # the page hides their rows at first
-        "only_lost": len(counts) == 1,
-        "rows": table.html(style="events", key="events", kinds=kinds, moments=moments),
-    }
+    shown = table.html(style="events", key="events", kinds=kinds, moments=moments)
+    return Section(key="log", title="Events", sentences=tuple(sentences), html=shown)
 
 
 def _before(event: Event) -> Moment:
     return Moment(max(0.0, event.time_s - BEFORE_S), event.arm)
 
 
-def _award_table(log: ShiftLog) -> Mapping[str, object] | None:
-    """Why each arm got its job: the offers behind each award, side by side; None without offers."""
-    arms = log.arms
+def _award_section(log: ShiftLog) -> Iterator[Section]:
+    """Why each arm got its job: the offers behind each award; nothing without offers."""
     awards = [list(group) for _, group in groupby(log.offers, key=lambda o: (o.time_s, o.job))]
     if not awards:
-        return None
-    every_arm = len(arms) <= MOST_ARMS
-    head = ("time", "job", "awarded to", *(arms if every_arm else ("its offer", "best other offers", "", "")))
+        return
     rows, moments = list[tuple[str, ...]](), list[Moment]()
     for award in awards[:MOST_AWARDS]:
         winner = next(offer for offer in award if offer.awarded)
-        if every_arm:
-            of = {offer.arm: offer for offer in award}
-            cells = [offer_text(of[arm]) if arm in of else "" for arm in arms]
-        else:
-            others = sorted(
-                (o for o in award if o.free and not o.awarded), key=lambda o: (o.p_saturation or 0.0, o.arm)
-            )
-            cells = [offer_text(winner), *(f"{o.arm}: {offer_text(o)}" for o in others[:3])]
-            cells += [""] * (4 - len(cells))
-        rows.append((clock(winner.time_s, log.begin), winner.job, winner.arm, *cells))
+        others = sorted((o for o in award if o is not winner), key=lambda o: (not o.free, o.p_saturation or 0.0, o.arm))
+        cells = (winner.arm, offer_text(winner), offers_text(others[:MOST_OFFERS]))
+        rows.append((clock(winner.time_s, log.begin), winner.job, *cells))
         moments.append(Moment(winner.time_s, winner.arm))
-    table = Table(head=head, rows=tuple(rows), numbers=False)
     left = f" The first {MOST_AWARDS} of {len(awards)} are listed; offers.parquet has all of them."
-    return {
-        "count": len(awards),
-        "more": left if len(awards) > MOST_AWARDS else "",
-        "rows": table.html(key="choices", moments=moments),
-    }
+    how = (
+        "P: probability that a motor passes its warning limit. Then the predicted peak, the difficulty d, and the "
+        "duration of the job; in brackets, why the arm could not take it then." + left * (len(awards) > MOST_AWARDS)
+    )
+    head = ("time", "job", "awarded to", "its offer", "other offers, the best first")
+    shown = Table(head=head, rows=tuple(rows), numbers=False).html(key="choices", moments=moments)
+    details = ((f"The offers behind {len(awards)} awards", shown),)
+    yield Section(key="awards", title="Why each arm got its job", how=how, details=details)
 
 
 def _request_table(requests: Sequence[Sequence[str]]) -> Table | None:
@@ -645,10 +618,6 @@ def other_choices(log: ShiftLog, other: ShiftLog) -> list[str]:
     return lines
 
 
-BAR_PX, TITLE_PX = 24, 44
-"""Height of a bar, and of the title and the gap above the bars of a figure."""
-
-
 def runs_table(logs: Mapping[str, ShiftLog]) -> Table:
     """Settings, outcome and key figures, a column for each run by its name; "" for a figure that a run lacks."""
     settings = {
@@ -661,6 +630,40 @@ def runs_table(logs: Mapping[str, ShiftLog]) -> Table:
     figures = figure_table({name: log.card.get("metrics") or {} for name, log in logs.items()})
     rows = [(name, *cells, *([""] if len(logs) == 2 else [])) for name, cells in settings.items()]
     return replace(figures, rows=(*rows, *figures.rows))
+
+
+def bars(logs: Mapping[str, ShiftLog]) -> Figure:
+    """The main figures one below the other, each with a bar for each run."""
+    values = [numbers(log.card.get("metrics") or {}) for log in logs.values()]
+    shown = [each for each in KEY_FIGURES if each.name in MAIN_FIGURES and any(each.name in own for own in values)]
+    names, rows = [plain(name, STREAM_NAME) for name in logs], list(range(len(logs)))
+    block_px = TITLE_PX + BAR_PX * len(logs)
+    height_px = block_px * max(1, len(shown))
+    data, layout, titles = list[dict[str, Any]](), dict[str, Any](), list[dict[str, Any]]()
+    for number, (label, name, form, unit, _) in enumerate(shown, start=1):
+        top = 1 - ((number - 1) * block_px + TITLE_PX) / height_px
+        own = [each.get(name) for each in values]
+        text = ["" if value is None else f"{value:{form}}" for value in own]
+        look = {
+            "textposition": "outside",
+            "textangle": 0,
+            "cliponaxis": False,
+            "hovertemplate": "%{text}<extra></extra>",
+        }
+        look |= {"marker": {"color": [COLOURS[k % len(COLOURS)] for k in rows]}}
+        axes = {"xaxis": f"x{number}", "yaxis": f"y{number}"}
+        data.append({"type": "bar", "orientation": "h", "x": own, "y": rows, "text": text} | look | axes)
+        layout[f"xaxis{number}"] = AXIS | {"anchor": f"y{number}", "rangemode": "tozero", "visible": False}
+        domain = [max(0.0, top - BAR_PX * len(logs) / height_px), top]
+        layout[f"yaxis{number}"] = named_rows(names, anchor=f"x{number}", domain=domain)
+        place = {"x": 0, "xref": "paper", "xanchor": "left", "y": top, "yref": "paper", "yanchor": "bottom"}
+        titles.append({"text": f"<b>{Column(label, unit)}</b>", "showarrow": False, **place})
+    size = {"height": height_px + 16, "margin": {"l": 60, "r": 48, "t": 4, "b": 12}}
+    return {"data": data, "layout": LAYOUT | layout | size | {"annotations": titles, "showlegend": False}}
+
+
+BAR_PX, TITLE_PX = 24, 44
+"""Height of a bar, and of the title and the gap above the bars of a figure."""
 
 
 def runs_page(
@@ -691,69 +694,27 @@ def runs_page(
             alt = f"Hottest motor over the shift under {', '.join(logs)}"
             charts.append(Chart(key="hottest", figure=hottest_motors(logs), alt=alt))
         replay = _playback([*logs.values()], model) if model else None
-    main = Chart(key="main", figure=bars(logs), alt=f"Main figures of {', '.join(logs)}; the table has them")
+    sections, badges = list[Section](), list[Badge]()
+    for number, (name, log) in enumerate(logs.items()):
+        outcome = verdict(log)
+        badges.append(Badge(f"{name}: {outcome.badge}", outcome.good, next(map(_before, log.faults), None)))
+        others = [line for other in logs.values() for line in other_choices(log, other)] if equal_jobs else []
+        sections.append(Section(key=f"run-{number}", title=name, sentences=(*outcome.sentences, *others)))
     hashes = ("code_hash", "scenario_hash")
-    content = {
-        "sentences": lead or (f"The runs differ in {', '.join(differ) or 'nothing'}. {jobs}",),
-        "sides": [
-            {
-                "name": name,
-                "verdict": verdict(log),
-                "first": next(map(_before, log.faults), None),
-                "other_choices": [line for other in logs.values() for line in other_choices(log, other)]
-                if equal_jobs
-                else (),
-                "report": quote((reports or {}).get(name, "")),
-            }
-            for name, log in logs.items()
-        ],
-        "charts": charts,
-        "replays": tuple(logs) if replay else (),
-        "main": main,
-        "table": table,
-        "origin": Table(
-            head=("run", "hash of the code", "hash of the scenario"),
-            rows=tuple((name, *(str(log.card.get(key, "")) for key in hashes)) for name, log in logs.items()),
-            numbers=False,
-        ),
-    }
+    origin = Table(
+        head=("run", "hash of the code", "hash of the scenario"),
+        rows=tuple((name, *(str(log.card.get(key, "")) for key in hashes)) for name, log in logs.items()),
+        numbers=False,
+    )
+    charts.append(Chart(key="main", figure=bars(logs), alt=f"Main figures of {', '.join(logs)}; the table has them"))
+    figures = Section(key="figures", title="Figures", charts=tuple(charts), html=table.html(style="compared"))
+    head = Head(
+        badges=badges,
+        sentences=lead[:1] or (f"The runs differ in {', '.join(differ) or 'nothing'}. {jobs}",),
+        remarks=lead[1:],
+        replay=replay,
+        names=tuple(logs),
+        links={name: quote(path) for name, path in (reports or {}).items()},
+    )
     title = title or f"{len(logs)} runs{'' if 'scenario' in differ else f' of {table.rows[0][1]}'}"
-    return Page(title=title, template="runs.html", content=content, charts=[*charts, main], replay=replay).html()
-
-
-def bars(logs: Mapping[str, ShiftLog]) -> Figure:
-    """The main figures one below the other, each with a bar for each run."""
-    values = [numbers(log.card.get("metrics") or {}) for log in logs.values()]
-    shown = [each for each in MAIN_FIGURES if any(each.name in own for own in values)]
-    block_px = TITLE_PX + BAR_PX * len(logs)
-    height_px = block_px * max(1, len(shown))
-    names = [plain(name, STREAM_NAME) for name in logs]
-    data, layout, titles = list[dict[str, Any]](), dict[str, Any](), list[dict[str, Any]]()
-    for number, (label, name, form, unit, _) in enumerate(shown, start=1):
-        top = 1 - ((number - 1) * block_px + TITLE_PX) / height_px
-        own = [each.get(name) for each in values]
-        text = [f"{value:{form}}" if value is not None else "" for value in own]
-        axes = {"xaxis": f"x{number}", "yaxis": f"y{number}"}
-        look = {"color": [POLICY_LINES[k % len(POLICY_LINES)][0] for k in range(len(names))]}
-        data.append(
-            {"type": "bar", "orientation": "h", "x": own, "y": list(range(len(own))), "text": text, "marker": look}
-            | {
-                "hovertemplate": "%{text}<extra></extra>",
-                "textposition": "outside",
-                "textangle": 0,
-                "cliponaxis": False,
-                **axes,
-            }
-        )
-        layout[f"xaxis{number}"] = AXIS | {"anchor": f"y{number}", "rangemode": "tozero", "visible": False}
-        domain = [max(0.0, top - BAR_PX * len(logs) / height_px), top]
-        layout[f"yaxis{number}"] = named_rows(names, anchor=f"x{number}", domain=domain)
-        place = {"x": 0, "xref": "paper", "xanchor": "left", "y": top, "yref": "paper", "yanchor": "bottom"}
-        titles.append({"text": f"<b>{Column(label, unit)}</b>", "showarrow": False, **place})
-    margin = {"l": 60, "r": 48, "t": 4, "b": 12}
-    return {
-        "data": data,
-        "layout": LAYOUT
-        | layout
-        | {"height": height_px + 16, "margin": margin, "annotations": titles, "showlegend": False},
-    }
+    return Page(title=title, sections=[figures, *sections], head=head, origin=origin, narrow=False).html()

@@ -1,32 +1,27 @@
-"""Plotly figures of shifts: Gantt chart above and motor temperatures below, or the hottest motors of several shifts.
-
-The figures are plain dicts in Plotly's schema, because Plotly's own objects take longer than the rest of a report.
-"""
+"""Charts of shifts: work of each arm, motor temperatures, and the hottest motors of several shifts."""
 
 import base64
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
-from itertools import cycle
 from typing import Any, TypeVar  # Any: values of Plotly's schema
 
 import numpy as np
 
 from fleet.env.render.heat import HEAT, heat_marks
-from fleet.events import Event
-from fleet.robot import JOINTS, ThermalLimits
+from fleet.robot import JOINTS
 from fleet.telemetry import Telemetry
 from scenarios.run.records import JobSpan, Outage, ShiftLog
-from scenarios.show import page
-from scenarios.show.page import AXIS, INK, axis, plain
-from scenarios.show.words import clock, duration
+from scenarios.show import charts
+from scenarios.show.charts import AXIS, FAULT, INK, WARNING, Trace, plain
+from scenarios.show.page import Chart
+from scenarios.show.words import clock, duration, event_text
 
 Array = np.ndarray
-Trace = dict[str, Any]
 Span = TypeVar("Span", JobSpan, Outage)
 
 STREAM_COLOURS = ("#4477aa", "#ddaa33", "#228833", "#aa4499", "#66ccee", "#997755", "#999933", "#555566")
-FAULT, WARNING, FAILURE, BREAK = "#cc2222", "#e08a00", "#444444", "#8a8a8a"
-BAR = {"type": "bar", "orientation": "h", "legend": "legend"}
+FAILURE, BREAK = "#444444", "#8a8a8a"
+BAR = {"type": "bar", "orientation": "h"}
 BAR_HEIGHT, BREAK_HEIGHT = 0.62, 0.24
 """In rows; a fault may last into a break."""
 LATE = {"color": INK, "width": 1.6}
@@ -46,86 +41,44 @@ MOST_LANES, HOTTEST = 16, 5
 HEAT_BINS = 1440
 """Columns of the heat map."""
 
-JOINT_LINES = (
-    ("#4a6fd0", "longdashdot"),
-    ("#cc6677", "solid"),
-    ("#228a44", "dash"),
-    ("#2f8fb5", "dot"),
-    ("#b554a8", "longdash"),
-    ("#8a8a2a", "1px,5px"),
-    ("#2f9488", "dashdot"),
-)
-"""Colour and dash of each joint. Each colour has a contrast above 3 on light and dark pages; the dashes tell apart what
-looks alike to people who see few colours."""
-
-POLICY_LINES = (
-    ("#0072b2", "solid"),
-    ("#d55e00", "dash"),
-    ("#009e73", "dot"),
-    ("#cc79a7", "longdash"),
-    ("#a07800", "dashdot"),
-    ("#7a5195", "longdashdot"),
-)
-"""Colour and dash of each of several shifts."""
-
-MARGIN = {"l": 90, "r": 84, "b": 52}
-NARROW_PX = 860
-"""Width of the plotting area on a small laptop; a legend wraps at this width."""
-LEGEND_ROW_PX = 20.0
-NAME_PX = 20.0
-"""Height of the name of an arm above its lane."""
-MAP_GAP_PX, MAP_ROW_PX = 90.0, 8.0
-GAP_PX = 172.0
-"""Height between the two blocks, for an axis, a title and a legend."""
+MAP_ROW_PX = 8.0
 BETWEEN_LANES_PX = 28.0
-
-LAYOUT = page.LAYOUT | {"modebar": {"orientation": "v"}, "barmode": "overlay", "dragmode": "zoom"}
-LEGEND = {
-    "orientation": "h",
-    "x": 0,
-    "xanchor": "left",
-    "yanchor": "bottom",
-    "bgcolor": "rgba(255,255,255,0)",
-    "tracegroupgap": 0,
-}
-TEXT = {"xref": "paper", "xanchor": "left", "showarrow": False}
+AROUND_PX = 100.0
+"""Height of the axis of time and the legend; the page makes more where a legend has several lines."""
+TEXT = {"xref": "paper", "xanchor": "left", "yanchor": "bottom", "showarrow": False, "font": {"size": 12}}
+LAYOUT = charts.WITH_LEGEND | {"margin": charts.MARGIN | {"l": 90, "r": charts.LIMITS_PX, "b": 52}, "dragmode": "zoom"}
 
 
-def figure(log: ShiftLog) -> dict[str, Any]:
-    """The figure: `data` and `layout` in Plotly's schema."""
-    plan, telemetry, arms = log.plan, log.readings, log.arms
-    unit, unit_s = time_unit(plan.horizon_s)
-    bars = _gantt(log, unit_s)
-    lanes = _lanes(telemetry, len(arms))
-    overview = len(lanes) < len(arms)
-    time = AXIS | {
-        "range": [0, max(plan.horizon_s / unit_s, 1e-3)],
-        "title": {"text": _time_title(log, unit), "standoff": 6},
-        "domain": [0, 1],
+def shift_charts(log: ShiftLog) -> dict[str, Chart]:
+    """Charts of a shift by heading; their axes show the same times."""
+    arms, lanes = log.arms, _lanes(log.readings, len(log.arms))
+    unit, unit_s = time_unit(log.plan.horizon_s)
+    title = {"text": _time_title(log, unit), "standoff": 6}
+    time = AXIS | {"range": [0, max(log.plan.horizon_s / unit_s, 1e-3)], "title": title}
+    rows = charts.named_rows([plain(arm, ARM_NAME) for arm in arms], fixedrange=True)
+    heat_map, which = {}, ""
+    if len(lanes) < len(arms):
+        every, which = -(-len(arms) // 50), " of the hottest arms"
+        rows |= {"tickfont": {"size": 8}, **{name: rows[name][::every] for name in ("tickvals", "ticktext")}}
+        heat_map = {"Hottest motor of each arm": _heat_map(log, time, rows, unit, unit_s)}
+    figures = {
+        "Work of each arm": _work(log, time, rows, unit_s),
+        **heat_map,
+        f"Motor temperatures{which}": _temperatures(log, lanes, time, unit, unit_s),
     }
-    layout = LAYOUT | _blocks(arms, lanes, _legend_height(bars))
-    layout["xaxis"] = time | {"anchor": "y"}
-    layout["xaxis2"] = time | {"anchor": f"y{len(lanes) + 1}", "matches": "x"}
-    title = {"text": "°C", "standoff": 8}
-    temperature = AXIS | {"range": _range_c(telemetry.temp_c, log.limits), "title": title, "anchor": "x2", "nticks": 6}
-    layout["shapes"] = []
-    for lane in range(len(lanes)):
-        key = f"yaxis{lane + 2}"
-        layout[key] = temperature | layout[key] | ({"matches": "y2"} if lane else {})
-        shapes, labels = _limit_lines(log.limits, f"y{lane + 2}")
-        layout["shapes"] += shapes
-        layout["annotations"] += labels
-    layout["shapes"] += _outages(plan.outages, [arms[a] for a in lanes], unit_s)
-    data = [*bars, *_temperatures(telemetry, arms, lanes, unit, unit_s)]
-    if overview:
-        number = len(lanes) + 2
-        layout["xaxis3"] = time | {"anchor": f"y{number}", "matches": "x"}
-        # The page may show any other arm in the last lane.
-        title = len(lanes)  # annotations: the title of the heat map, then those of the lanes
-        layout["meta"] = {"lane_traces": list(range(len(data) - JOINTS, len(data))), "lane_title": title}
-        heat = _heat_map(log, number, unit, unit_s)
-        data.append(heat | {"colorbar": heat["colorbar"] | {"y": layout[f"yaxis{number}"]["domain"][1]}})
-    return {"data": data, "layout": layout}
+    return {
+        heading: Chart(key=f"chart-{number}", figure=figure, alt=f"{heading} over the shift")
+        for number, (heading, figure) in enumerate(figures.items())
+    }
+
+
+def _work(log: ShiftLog, time: Trace, rows: Trace, unit_s: float) -> Trace:
+    """The Gantt chart."""
+    count = len(log.arms)
+    height_px = max(90.0, count * (40.0 if count <= 8 else 26.0 if count <= MOST_LANES else 12.0))
+    rows = rows | {"range": [count - 0.4, -0.65]}
+    own = {"height": height_px + AROUND_PX, "barmode": "overlay", "xaxis": time, "yaxis": rows}
+    return {"data": _gantt(log, unit_s), "layout": LAYOUT | own}
 
 
 def hottest_motors(logs: Mapping[str, ShiftLog]) -> dict[str, Any]:
@@ -133,54 +86,21 @@ def hottest_motors(logs: Mapping[str, ShiftLog]) -> dict[str, Any]:
     first = next(iter(logs.values()))
     unit, unit_s = time_unit(first.plan.horizon_s)
     traces, values = list[Trace](), list[Array]()
-    for (name, log), (colour, dash) in zip(logs.items(), cycle(POLICY_LINES), strict=False):
+    for number, (name, log) in enumerate(logs.items()):
         temp_c = log.readings.temp_c.reshape(len(log.readings.time_s), -1)  # NaN of an absent arm
         motor = np.nan_to_num(temp_c, nan=-np.inf).argmax(axis=1)
         values.append(temp_c[np.arange(len(motor)), motor])
-        kept = decimate(values[-1], POINTS_PER_TRACE)
+        kept = charts.decimate(values[-1], POINTS_PER_TRACE)
         texts = [plain(f"{log.arms[m // JOINTS]}, joint {m % JOINTS + 1}") for m in motor[kept].tolist()]
         hover = f"{plain(name)}: %{{y:.1f}} °C at %{{x:.1f}} {unit}<br>%{{customdata}}<extra></extra>"
-        line = {"color": colour, "width": 2, "dash": dash}
-        trace = _curve(plain(name, STREAM_NAME), log.readings.time_s[kept] / unit_s, values[-1][kept], line, hover)
-        traces.append(trace | {"customdata": texts})
-    shapes, labels = _limit_lines(first.limits, "y")
-    time = axis(_time_title(first, unit), range=[0, first.plan.horizon_s / unit_s])
-    temperature = axis("hottest motor, °C", range=_range_c(np.concatenate(values), first.limits))
-    return {
-        "data": traces,
-        "layout": LAYOUT
-        | {"height": 360, "margin": MARGIN | {"l": 60, "t": 36}, "showlegend": True, "legend": LEGEND | {"y": 1.02}}
-        | {"modebar": {"orientation": "h"}}
-        | {"xaxis": time, "yaxis": temperature, "shapes": shapes, "annotations": labels},
-    }
-
-
-def _range_c(temp_c: Array, limits: ThermalLimits) -> list[float]:
-    """Range of an axis with these temperatures (NaN of absent arms) and both limits, °C."""
-    low_c = float(np.fmin.reduce(temp_c, axis=None, initial=limits.warning_c - 20.0))
-    high_c = float(np.fmax.reduce(temp_c, axis=None, initial=limits.error_c))
-    room_k = 0.06 * (high_c - low_c)
-    return [low_c - room_k, high_c + room_k]
-
-
-def _curve(name: str, time: Array, value: Array, line: Trace, hover: str) -> Trace:
-    look = {"type": "scatter", "mode": "lines", "name": name, "line": line, "hovertemplate": hover}
-    return look | {"x": _packed(time), "y": _packed(value)}
-
-
-def _limit_lines(limits: ThermalLimits, y: str) -> tuple[list[Trace], list[Trace]]:
-    """Lines of the limits over the whole width of a y axis, and their labels."""
-    lines, labels = list[Trace](), list[Trace]()
-    for name, limit_c, colour, anchor, dash in (
-        ("error", limits.error_c, FAULT, "bottom", "solid"),
-        ("warning", limits.warning_c, WARNING, "top", "longdash"),
-    ):
-        at = {"yref": y, "y0": limit_c, "y1": limit_c, "xref": "paper", "x0": 0, "x1": 1}
-        lines.append(at | {"type": "line", "line": {"color": colour, "width": 1, "dash": dash}})
-        aside = {"x": 1, "xshift": 4, "y": limit_c, "yref": y, "yanchor": anchor, "font": {"size": 10}}
-        label = {"text": f"{name} {limit_c:g} °C", "yshift": -5 if anchor == "bottom" else 5}
-        labels.append(TEXT | aside | label)
-    return lines, labels
+        x, more = log.readings.time_s[kept] / unit_s, {"customdata": texts, "hovertemplate": hover}
+        traces.append(charts.curve(plain(name, STREAM_NAME), x, values[-1][kept], charts.look_of(number), **more))
+    shapes, labels = charts.limit_lines(first.limits)
+    time = charts.axis(_time_title(first, unit), range=[0, first.plan.horizon_s / unit_s])
+    temperature = charts.axis("hottest motor, °C", range=charts.range_c(np.concatenate(values), first.limits))
+    margin = charts.MARGIN | {"r": charts.LIMITS_PX}
+    own = {"margin": margin, "xaxis": time, "yaxis": temperature, "shapes": shapes, "annotations": labels}
+    return {"data": traces, "layout": charts.WITH_LEGEND | own}
 
 
 def _gantt(log: ShiftLog, unit_s: float) -> list[Trace]:
@@ -206,8 +126,9 @@ def _gantt(log: ShiftLog, unit_s: float) -> list[Trace]:
                 "x": [round(e.time_s / unit_s, 5) for e in marked],
                 "y": [arms.index(e.arm) - 0.42 for e in marked],
             }
-            trace = {"type": "scatter", "mode": "markers", "name": kind, "marker": look, "legend": "legend"}
-            traces.append(trace | at | _hover([_event_text(e, log.begin) for e in marked]))
+            trace = {"type": "scatter", "mode": "markers", "name": kind, "marker": look}
+            texts = [f"<b>{plain(e.arm)}</b> at {clock(e.time_s, log.begin)}<br>{plain(event_text(e))}" for e in marked]
+            traces.append(trace | at | _hover(texts))
     return traces
 
 
@@ -310,12 +231,6 @@ def _outage_text(o: Outage, begin: datetime | None) -> str:
     )
 
 
-def _event_text(e: Event, begin: datetime | None) -> str:
-    """Hover text of one event."""
-    job = f"<br>{plain(e.job)}" if e.job else ""
-    return f"<b>{e.kind}</b> of {plain(e.arm)} at {clock(e.time_s, begin)}<br>{plain(e.reason)}{job}"
-
-
 def _lanes(telemetry: Telemetry, arms: int) -> list[int]:
     """Indices of the arms with a lane of temperatures: all of a small fleet, the hottest of a large one."""
     if arms <= MOST_LANES:
@@ -324,8 +239,8 @@ def _lanes(telemetry: Telemetry, arms: int) -> list[int]:
     return np.argsort(-peak_c, kind="stable")[:HOTTEST].tolist()
 
 
-def _heat_map(log: ShiftLog, lane: int, unit: str, unit_s: float) -> Trace:
-    """The hottest motor of each arm over time, one row per arm; y axis `lane`, x axis 3."""
+def _heat_map(log: ShiftLog, time: Trace, rows: Trace, unit: str, unit_s: float) -> Trace:
+    """The hottest motor of each arm over time, one row per arm."""
     telemetry, arms, warning_c, error_c = log.readings, log.arms, log.limits.warning_c, log.limits.error_c
     samples = len(telemetry.time_s)
     edges = np.unique(np.linspace(0, samples, min(samples, HEAT_BINS) + 1).astype(int))[:-1]
@@ -337,17 +252,15 @@ def _heat_map(log: ShiftLog, lane: int, unit: str, unit_s: float) -> Trace:
     kelvin = np.clip(np.round((peak_c - low) * 2), 0, 255).astype(np.uint8)
     shares = (marks - low) / (high - low)
     names = [plain(arm) for arm in arms]
-    return {
+    heat = {
         "type": "heatmap",
         "z": {
             "dtype": "u1",
             "bdata": base64.b64encode(kelvin.tobytes()).decode(),
             "shape": f"{len(arms)},{len(edges)}",
         },
-        "x": _packed(telemetry.time_s[edges] / unit_s),
+        "x": charts.packed_numbers(telemetry.time_s[edges] / unit_s),
         "y": list(range(len(arms))),
-        "xaxis": "x3",
-        "yaxis": f"y{lane}",
         "zmin": 0,
         "zmax": 2 * (high - low),
         "colorscale": [[float(share), colour] for share, colour in zip(shares, HEAT, strict=True)],
@@ -358,12 +271,14 @@ def _heat_map(log: ShiftLog, lane: int, unit: str, unit_s: float) -> Trace:
             "thickness": 12,
             "lenmode": "pixels",
             "len": min(200, MAP_ROW_PX * len(arms)),
+            "y": 1,
             "yanchor": "top",
         },
         "customdata": names,
         "hovertemplate": f"%{{y}}<br>%{{x:.2f}} {unit}<extra></extra>",
-        "showlegend": False,
     }
+    height_px = len(arms) * MAP_ROW_PX + AROUND_PX
+    return {"data": [heat], "layout": LAYOUT | {"height": height_px, "xaxis": time, "yaxis": rows}}
 
 
 def time_unit(horizon_s: float) -> tuple[str, float]:
@@ -376,82 +291,13 @@ def _time_title(log: ShiftLog, unit: str) -> str:
     return f"time ({unit})" if log.begin is None else f"time since {log.begin:%a %d %b %H:%M} ({unit})"
 
 
-def _blocks(arms: Sequence[str], lanes: Sequence[int], legend_px: float) -> dict[str, Any]:
-    """Heights, titles and legends of the Gantt chart, of the heat map of a large fleet, and of the lanes."""
-    overview = len(lanes) < len(arms)
-    gantt_px = max(90.0, len(arms) * (40.0 if len(arms) <= 8 else 26.0 if not overview else 12.0))
-    lane_px = 120.0 if len(lanes) <= 8 else 84.0
-    map_px = len(arms) * MAP_ROW_PX if overview else 0.0
-    map_top = gantt_px + MAP_GAP_PX
-    first = map_top + map_px if overview else gantt_px
-    tops = [first + GAP_PX + a * (lane_px + BETWEEN_LANES_PX) for a in range(len(lanes))]
-    total_px = tops[-1] + lane_px
-
-    def paper(from_top_px: float) -> float:
-        """Plotly's coordinate: 1 at the top, 0 at the bottom."""
-        return 1.0 - from_top_px / total_px
-
-    def title(text: str, from_top_px: float, size: int = 15) -> dict[str, Any]:
-        place = {"x": 0, "y": paper(from_top_px), "yref": "paper", "yanchor": "bottom"}
-        return TEXT | place | {"text": f"<b>{text}</b>", "font": {"size": size}}
-
-    rows: dict[str, Any] = {
-        "domain": [paper(gantt_px), 1.0],
-        "range": [len(arms) - 0.4, -0.65],
-        "tickvals": list(range(len(arms))),
-        "ticktext": [plain(arm, ARM_NAME) for arm in arms],
-        "showgrid": False,
-        "fixedrange": True,
-        "automargin": True,
-    }
-    heat: Trace = {}
-    if overview:
-        rows["tickfont"] = {"size": 8}
-        place = {"domain": [paper(map_top + map_px), paper(map_top)], "anchor": "x3", "range": [len(arms) - 0.5, -0.5]}
-        every = slice(None, None, -(-len(arms) // 50))
-        marks = {name: rows[name][every] for name in ("tickvals", "ticktext")}
-        heat = {f"yaxis{len(lanes) + 2}": AXIS | rows | place | marks}
-    return {
-        "height": round(total_px + legend_px + 44.0 + MARGIN["b"]),
-        "margin": MARGIN | {"t": round(legend_px + 44.0)},
-        "yaxis": AXIS | rows,
-        **heat,
-        **{f"yaxis{a + 2}": {"domain": [max(0.0, paper(y + lane_px)), paper(y)]} for a, y in enumerate(tops)},
-        "legend": LEGEND | {"y": paper(-6.0), "itemclick": "toggle", "title": _heading("Work of each arm")},
-        "legend2": LEGEND
-        | {
-            "y": paper(tops[0] - NAME_PX - 6.0),
-            "itemdoubleclick": "toggleothers",
-            "title": _heading(f"Motor temperatures{' of the hottest arms' if overview else ''}"),
-        },
-        "annotations": [
-            *([title("Hottest motor of each arm", map_top - 8.0)] if overview else []),
-            *(title(plain(arms[a], STREAM_NAME), y - 2.0, size=12) for a, y in zip(lanes, tops, strict=True)),
-        ],
-    }
-
-
-def _heading(text: str) -> dict[str, Any]:
-    """Title of a legend, above its entries; so the two cannot overlap."""
-    return {"text": f"<b>{text}</b>", "side": "top", "font": {"size": 15}}
-
-
-def _legend_height(bars: Sequence[Trace]) -> float:
-    """Height of the upper legend, px; on a narrow page it has several lines, with columns of equal width."""
-    wide = [45.0 + 6.5 * len(trace["name"]) for trace in bars]
-    if sum(wide) <= NARROW_PX:
-        return LEGEND_ROW_PX
-    per_row = max(1, int(NARROW_PX // max(wide)))
-    return LEGEND_ROW_PX * -(-len(wide) // per_row)
-
-
 def _outages(outages: Sequence[Outage], arms: Sequence[str], unit_s: float) -> list[dict[str, Any]]:
     """Faults as vertical lines and outages as shade in the lane of their arm; arms without a lane are left out."""
     shapes = []
     for o in outages:
         if o.arm not in arms:
             continue
-        lane = {"xref": "x2", "yref": f"y{arms.index(o.arm) + 2} domain", "y0": 0, "y1": 1}
+        lane = {"xref": "x", "yref": f"y{arms.index(o.arm) + 1} domain", "y0": 0, "y1": 1}
         start, end = round(o.start_s / unit_s, 5), round(o.end_s / unit_s, 5)
         shapes += [
             lane | {"type": "rect", "x0": start, "x1": end, "fillcolor": FAULT, "opacity": 0.10, "line": {"width": 0}},
@@ -460,48 +306,29 @@ def _outages(outages: Sequence[Outage], arms: Sequence[str], unit_s: float) -> l
     return shapes
 
 
-def _temperatures(
-    telemetry: Telemetry, arms: Sequence[str], lanes: Sequence[int], unit: str, unit_s: float
-) -> list[Trace]:
-    points = int(np.clip(POINTS_IN_ALL // max(1, JOINTS * len(lanes)), FEWEST_POINTS, POINTS_PER_TRACE))
-    traces = []
-    for lane, a in enumerate(lanes):
-        arm = arms[a]
-        for j, (colour, dash) in enumerate(JOINT_LINES):
-            value, name = telemetry.temp_c[:, a, j], f"joint {j + 1}"
-            kept = decimate(value, points)
+def _temperatures(log: ShiftLog, lanes: Sequence[int], time: Trace, unit: str, unit_s: float) -> Trace:
+    """All motors of some arms, a lane for each arm."""
+    telemetry, arms, count = log.readings, [log.arms[a] for a in lanes], len(lanes)
+    lane_px = 120.0 if count <= 8 else 84.0
+    total_px = count * (lane_px + BETWEEN_LANES_PX)
+    points = int(np.clip(POINTS_IN_ALL // max(1, JOINTS * count), FEWEST_POINTS, POINTS_PER_TRACE))
+    shown_c = charts.range_c(telemetry.temp_c, log.limits)
+    layout, traces = LAYOUT | {"height": total_px + AROUND_PX, "xaxis": time | {"anchor": f"y{count}"}}, list[Trace]()
+    layout |= {"shapes": _outages(log.plan.outages, arms, unit_s), "annotations": []}
+    for lane, arm in enumerate(arms):
+        bottom, y = 1.0 - (lane + 1) / count, f"y{lane + 1}"
+        own = {"domain": [bottom, bottom + lane_px / total_px], **({"matches": "y"} if lane else {})}
+        layout[f"yaxis{lane + 1 if lane else ''}"] = charts.axis("°C", range=shown_c, nticks=6, **own)
+        lines, labels = charts.limit_lines(log.limits, y)
+        layout["shapes"] += lines
+        text = {"text": f"<b>{plain(arm, STREAM_NAME)}</b>", "x": 0, "y": own["domain"][1], "yref": "paper"}
+        layout["annotations"] += [*labels, TEXT | text]
+        for j, (colour, dash) in enumerate(charts.JOINT_LINES):
+            value, name = telemetry.temp_c[:, lanes[lane], j], f"joint {j + 1}"
             hover = f"{plain(arm)} {name}<br>%{{y:.1f}} °C at %{{x:.2f}} {unit}<extra></extra>"
             line = {"color": colour, "width": 1.5, "dash": dash}
-            place = {"legendgroup": name, "legend": "legend2", "showlegend": lane == 0}
-            place |= {"xaxis": "x2", "yaxis": f"y{lane + 2}"}
-            traces.append(_curve(name, telemetry.time_s[kept] / unit_s, value[kept], line, hover) | place)
-    return traces
-
-
-def decimate(value: Array, limit: int) -> Array:
-    """Samples that keep the look of a long line: lowest and highest of each bin, and its gap if it has one.
-
-    Args:
-        value: [sample]; NaN is a gap.
-        limit: Most samples to keep, at least 5.
-
-    Returns:
-        Indices in order, with the first, the last and both extremes among them, int [kept <= limit].
-    """
-    if limit < 5:
-        raise ValueError(f"limit must be >= 5 (got {limit}).")
-    if len(value) <= limit:
-        return np.arange(len(value))
-    gap = np.isnan(value)
-    picks = [np.where(gap, np.inf, value), np.where(gap, np.inf, -value), *([~gap] if gap.any() else [])]
-    edges = np.linspace(0, len(value), (limit - 2) // len(picks) + 1).astype(int)
-    keep = [0, len(value) - 1]
-    for low, high in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        keep += [low + int(pick[low:high].argmin()) for pick in picks]
-    return np.unique(keep)
-
-
-def _packed(values: Array) -> dict[str, str]:
-    """Numbers in Plotly's packed format, a third of the length of decimals."""
-    raw = np.ascontiguousarray(values, dtype="<f4").tobytes()
-    return {"dtype": "f4", "bdata": base64.b64encode(raw).decode("ascii")}
+            place = {"legendgroup": name, "showlegend": lane == 0, "hovertemplate": hover, "yaxis": y}
+            traces.append(charts.curve(name, telemetry.time_s / unit_s, value, line, most=points, **place))
+    if count < len(log.arms):  # the page may show any other arm in the last lane: its traces, and its title
+        layout["meta"] = {"lane_traces": list(range(len(traces) - JOINTS, len(traces))), "lane_title": 3 * count - 1}
+    return {"data": traces, "layout": layout}

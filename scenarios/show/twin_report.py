@@ -34,7 +34,8 @@ from scenarios.prepare.twins import (
 from scenarios.processes import worker_processes
 from scenarios.progress import Count, Progress, quiet
 from scenarios.result_folder import ResultKind, json_text
-from scenarios.show.page import AXIS, LAYOUT, Chart, Section, sections_page
+from scenarios.show.charts import AXIS, COLOURS, LAYOUT, Trace, curve
+from scenarios.show.page import Chart, Head, Page, Section, origin_table
 from scenarios.spec.jobs import rehearsal_works
 from scenarios.spec.schema import Scenario
 from scenarios.table import Table
@@ -48,15 +49,15 @@ from twin.vae.twin import Twin
 from twin.vae.window import cut, cut_jobs, draw_windows, resample, starts, windows_of
 
 Array = np.ndarray
-Cells = dict[tuple[int, int], list[dict[str, Any]]]
+Cells = dict[tuple[int, int], list[Trace]]
 """Plotly traces by row and column of a chart."""
 
 CARD, PAGE = "report.json", "report.html"
 REPORT = ResultKind(name="twin report", card=CARD, files=(CARD, PAGE))
 CHANNEL_NAMES = ("position", "velocity", "torque")
 CHANNEL_HEADS = ("position, rad", "velocity, rad/s", "torque, N·m")
-BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#8a8a8a"
-"""Cool or the twin, hot, untrained, other; of Okabe and Ito, for colour-blind readers."""
+BLUE, ORANGE, GREEN, GREY = (*COLOURS[:3], COLOURS[-1])
+"""Cool or the twin, hot, untrained, other."""
 LEAST_ERROR = 1e-6
 """Errors below it, in z units, count as equal."""
 MOST_POINTS = 1500
@@ -681,15 +682,13 @@ def _plain(values: Array) -> list[float | None]:
     return [float(f"{v:.4g}") if np.isfinite(v) else None for v in np.asarray(values, dtype=float)]
 
 
-def _line(values: Array, rate_hz: float, name: str, colour: str, dash: str = "solid") -> dict[str, Any]:
+def _line(values: Array, rate_hz: float, name: str, colour: str, dash: str = "solid") -> Trace:
     """A curve over time from samples [time]."""
-    every = max(1, len(values) // MOST_POINTS)
-    line = {"color": colour, "width": 1.3, "dash": dash}
-    points = {"x": _plain(np.arange(len(values))[::every] / rate_hz), "y": _plain(values[::every])}
-    return {"type": "scatter", "mode": "lines", "name": name, "line": line, **points}
+    look = {"color": colour, "width": 1.3, "dash": dash}
+    return curve(name, np.arange(len(values)) / rate_hz, values, look, most=MOST_POINTS)
 
 
-def _over_epochs(x: Sequence[str], y: Array, name: str, colour: str) -> dict[str, Any]:
+def _over_epochs(x: Sequence[str], y: Array, name: str, colour: str) -> Trace:
     """The mean over the seeds of y [seed, epochs], with the standard deviation as bars."""
     bars = {"type": "data", "array": _plain(y.std(axis=0, ddof=1)), "thickness": 1} if len(y) > 1 else None
     look = {"mode": "lines+markers", "line": {"color": colour}, "marker": {"size": 5}, "error_y": bars}
@@ -782,7 +781,8 @@ def write(chapters: Sequence[Section], origin: Mapping[str, str], folder: Path, 
 
     The `status` in report.json is finished even where chapters failed.
     """
-    (folder / PAGE).write_text(sections_page(title, chapters, origin, LIMITS), encoding="utf-8")
+    page = Page(title=title, sections=chapters, head=Head(sentences=LIMITS), origin=origin_table(origin))
+    (folder / PAGE).write_text(page.html(), encoding="utf-8")
     failed = {each.key: each.failed for each in chapters if each.failed}
     of_chapters = {
         each.key: {"title": each.title, "found": each.sentences, "how": each.how, "numbers": each.numbers}

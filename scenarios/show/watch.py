@@ -1,13 +1,10 @@
-"""`thermofleet bus watch`: a live fleet as a screen on the terminal, and as plain lines without a terminal."""
+"""`thermofleet bus watch`: a live fleet as a screen on the terminal, and as tables now and then without a terminal."""
 
 import math
-import os
-import select
-import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from typing import get_args
 
 import msgspec
@@ -25,46 +22,26 @@ from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetListener, Fle
 from fleet.live.space import ANYWHERE
 from scenarios.cli.options import the_fleet
 from scenarios.progress import brief
-from scenarios.show.words import clock
+from scenarios.show.words import clock, event_text
 from scenarios.signals import StopRequest, until_stopped
-from scenarios.terminal import echo, err_console, out_console, say
+from scenarios.terminal import echo, err_console, out_console, print_wide, say
 
 WAIT_S, GONE_S = 0.5, 3.0
 """Real seconds between two searches for a fleet, and without participants until a settled shift counts as ended."""
 OPEN: tuple[JobState, ...] = ("waiting", "awarded", "finishing")
 FRAME_S, LINE_S, SNAPSHOT_S = 0.25, 5.0, 1.0
-"""Real seconds between two frames, between two lines about an arm, and of listening for one snapshot."""
+"""Real seconds between two frames on a terminal, between two tables without one, and of listening for one snapshot."""
 HOT_K, WARM_K = 5.0, 10.0
 """Headroom below which an arm is shown in red, in yellow."""
 COOL_C = 20.0
 """A bar begins at this temperature and is full at the warning limit."""
-HEAT_CELLS, JOB_CELLS = 10, 6
-"""Characters of the bars."""
-FRAME, EVENTS = 8, 6
+HEAT_CELLS = 10
+"""Characters of a bar."""
+FRAME, EVENTS = 7, 6
 """Lines of the screen that are neither arms nor events; events shown."""
 WIDE = 120
 """Columns from which the scores of open jobs and the ages of messages are shown."""
-NOTHING_DONE: Mapping[str, float] = {}
-KEYS = "j: all joints · q: end"
 _MODE_STYLES = {"faulted": "bold red", "working": "green"}
-PLAIN = {
-    "award": "begins {job}",
-    "finish": "has finished {job}",
-    "home": "is home again",
-    "warning": "joint {joint} is above the warning limit",
-    "fault": "has stopped: joint {joint} is above the error limit",
-    "recover": "works again",
-    "moved": "was moved home by a person",
-    "torque_warning": "has a plan above the torque warning",
-    "return": "gives {job} back",
-    "give_back": "gives {job} back after a cycle",
-    "give_up": "gives {job} up",
-    "contact": "has touched something",
-    "failure": "has failed, not by heat",
-    "break": "has a break",
-    "break_end": "is back from a break",
-}
-"""Events in words; others are shown by their kind."""
 
 
 def watch(
@@ -163,138 +140,66 @@ class ShiftEnd:
 
 
 def follow(frames: Iterator[FleetSnapshot], news: deque[str], *, joints: bool, end_s: float | None) -> None:
-    """Show a fleet until the frames end: on a terminal as a screen, until the key q; else as lines.
-
-    Without a terminal, news are printed as they come, and a line about every arm from time to time.
-    """
-    bars, due_s = JobBars(), time.monotonic() + SNAPSHOT_S
+    """Show a fleet until the frames end: on a terminal as a screen; else news as they come, and tables now and then."""
+    due_s = time.monotonic() + SNAPSHOT_S
     with ExitStack() as resources:
-        live, pressed = None, no_keys
+        live = None
         if out_console.is_terminal:
-            pressed = resources.enter_context(pressed_keys())
             live = resources.enter_context(Live(console=out_console, screen=True, auto_refresh=False))
         for fleet in frames:
             if live is not None:
-                keys = pressed()
-                if "q" in keys:
-                    break
-                joints ^= keys.count("j") % 2 == 1
                 size = out_console.size
-                how = {"width": size.width, "joints": joints, "done": bars.update(fleet), "end_s": end_s}
+                how = {"width": size.width, "joints": joints, "end_s": end_s}
                 live.update(screen(fleet, list(news), size.height, **how), refresh=True)
                 continue
             while news:
                 echo(news.popleft())
             if time.monotonic() >= due_s:
                 due_s = time.monotonic() + LINE_S
-                for line in plain_lines(fleet, joints, end_s):
-                    echo(line)
-
-
-def plain_lines(fleet: FleetSnapshot, joints: bool, end_s: float | None) -> Iterator[str]:
-    """Lines about a fleet; arguments as of `watch`."""
-    yield from (arm_line(arm, joints=joints) for arm in fleet.arms)
-    yield from (line.plain for line in (jobs_line(fleet), space_line(fleet), alarm_line(fleet)))
-    if end_s is not None:
-        yield time_line(fleet, end_s).plain
-
-
-def no_keys() -> str:
-    """The keys of a program without a keyboard."""
-    return ""
-
-
-@contextmanager
-def pressed_keys() -> Iterator[Callable[[], str]]:
-    """A function that returns the keys pressed since it was last called, in lower case; none without a terminal."""
-    try:
-        import termios
-        import tty
-
-    except ModuleNotFoundError:  # Windows
-        yield no_keys
-        return
-    try:
-        before = termios.tcgetattr(sys.stdin.fileno())
-    except (OSError, ValueError, termios.error):  # no terminal, or closed
-        yield no_keys
-        return
-
-    def pressed() -> str:
-        keys = ""
-        while select.select([sys.stdin], [], [], 0.0)[0] and (more := os.read(sys.stdin.fileno(), 64)):
-            keys += more.decode("ascii", "ignore").lower()
-        return keys
-
-    try:
-        tty.setcbreak(sys.stdin.fileno())
-        yield pressed
-    finally:
-        termios.tcsetattr(sys.stdin.fileno(), termios.TCSADRAIN, before)
+                print_wide(screen(fleet, (), math.inf, width=WIDE, joints=joints, end_s=end_s))
 
 
 def describe(name: str, message: msgspec.Struct) -> str:
     """Line about an event or a result; "" for other messages."""
     if isinstance(message, ArmEvent):
-        return f"{format_time(message.time_s)}  {name} {plain_event(message)}"
+        return f"{clock(message.time_s)}  {name} {event_text(message)}"
     if isinstance(message, Result):
-        return f"{format_time(message.time_s)}  job {describe_status(message.status)}"
+        return f"{clock(message.time_s)}  job {describe_status(message.status)}"
     if isinstance(message, Alarm):
         seen = f"{message.by} has seen the alarm" if message.by else ""
         change = "alarm has ended" if message.ended_s is not None else seen or "alarm"
-        return f"{format_time(message.time_s)}  {change}: {message.what}"
+        return f"{clock(message.time_s)}  {change}: {message.what}"
     return ""
-
-
-class JobBars:
-    """How far each arm is with its job, as seen since the job was first shown."""
-
-    def __init__(self) -> None:
-        self._first: dict[str, tuple[str, float]] = {}
-
-    def update(self, fleet: FleetSnapshot) -> dict[str, float]:
-        """Part of its current job that each arm has done, 0 to 1."""
-        done: dict[str, float] = {}
-        known = self._first
-        self._first = {}
-        for arm in fleet.arms:
-            if arm.job and arm.busy_s > 0:
-                job, first_s = known.get(arm.arm, ("", 0.0))
-                self._first[arm.arm] = (arm.job, max(arm.busy_s, first_s if job == arm.job else 0.0))
-                done[arm.arm] = 1.0 - arm.busy_s / self._first[arm.arm][1]
-        return done
 
 
 def screen(
     fleet: FleetSnapshot,
     events: Sequence[str],
-    height: int,
+    height: float,
     *,
     width: int = 80,
     joints: bool = False,
-    done: Mapping[str, float] = NOTHING_DONE,
     end_s: float | None = None,
 ) -> Group:
     """The whole screen in at most `height` lines: if there are too many arms, those with the least headroom stay.
 
     Args:
         joints: Show every motor in place of jobs.
-        done: Part of its current job that each arm has done, 0 to 1.
         end_s: Fleet time at which the shift ends.
     """
-    events = events[-EVENTS:][max(0, len(events[-EVENTS:]) + FRAME + 1 - height) :]
+    events = events[max(0, len(events) - int(min(EVENTS, height - FRAME - 1))) :]
     room = max(1, height - FRAME - len(events))
     arms = fleet.arms
     if len(arms) > room:
         urgent = sorted(arms, key=lambda arm: (not arm.token, 1e9 if arm.headroom_k is None else arm.headroom_k))
-        shown = {arm.arm for arm in urgent[: room - 1]}
+        shown = {arm.arm for arm in urgent[: int(room) - 1]}
         arms = tuple(arm for arm in arms if arm.arm in shown)
     parts: list[Table | Text] = [heading(fleet), time_line(fleet, end_s)]
-    parts.append(joint_table(arms) if joints else arm_table(arms, done, wide=width >= WIDE))
+    parts.append(joint_table(arms) if joints else arm_table(arms, wide=width >= WIDE))
     if len(arms) < len(fleet.arms):
         parts.append(Text(f"… and {len(fleet.arms) - len(arms)} more with more headroom", style="dim"))
     parts += [jobs_line(fleet), space_line(fleet), alarm_line(fleet)]
-    return Group(*parts, *(_line((text, "dim")) for text in (*events, KEYS)))
+    return Group(*parts, *(_line((text, "dim")) for text in events))
 
 
 def _line(*parts: str | tuple[str, str]) -> Text:
@@ -316,21 +221,21 @@ def time_line(fleet: FleetSnapshot, end_s: float | None = None) -> Text:
     if now_s is None:
         return _line("no time yet")
     if end_s is None:
-        return _line(format_time(now_s))
+        return _line(clock(now_s))
     left_s, so_far = max(0.0, end_s - now_s), bar(now_s / end_s, 2 * HEAT_CELLS)
     speed = fleet.speed or 1.0
     real = f" ({brief(left_s / speed)} at {speed:g} ×)" if speed != 1.0 else ""
-    return _line(f"{so_far} {format_time(now_s)} of {format_time(end_s)}, {format_time(left_s)} left{real}")
+    return _line(f"{so_far} {clock(now_s)} of {clock(end_s)}, {clock(left_s)} left{real}")
 
 
-def arm_table(arms: Iterable[ArmSnapshot], done: Mapping[str, float] = NOTHING_DONE, *, wide: bool = False) -> Table:
+def arm_table(arms: Iterable[ArmSnapshot], *, wide: bool = False) -> Table:
     """One row per arm; `wide` adds scores of open jobs and ages of messages."""
     table = _table_of_arms()
     table.add_column("to warning", min_width=HEAT_CELLS + 1, no_wrap=True)
     table.add_column("hot °C", min_width=7, no_wrap=True, justify="right")
     table.add_column("room K", min_width=6, no_wrap=True, justify="right")
     table.add_column("current job", no_wrap=True, overflow="ellipsis", ratio=2, min_width=8)
-    table.add_column("to do", no_wrap=True, min_width=JOB_CELLS + 8)
+    table.add_column("left", no_wrap=True, min_width=6)
     if wide:
         table.add_column("open jobs: predicted peak, P, d", no_wrap=True, overflow="ellipsis", ratio=4)
         table.add_column("diff.", justify="right", min_width=5, no_wrap=True)
@@ -342,8 +247,8 @@ def arm_table(arms: Iterable[ArmSnapshot], done: Mapping[str, float] = NOTHING_D
             heat_bar(arm),
             "—" if arm.hottest_c is None else f"{arm.hottest_c:.1f} J{arm.joint}{'?' * bool(arm.bad_sensor)}",
             Text("—" if arm.headroom_k is None else f"{arm.headroom_k:.1f}", style=_headroom_style(arm.headroom_k)),
-            arm.job or format_motion(arm),
-            f"{bar(done[arm.arm], JOB_CELLS)} {brief(arm.busy_s)}" if arm.arm in done else "",
+            format_work(arm),
+            brief(arm.busy_s) if arm.job and arm.busy_s else "",
         ]
         if wide:
             token = Text("yes") if arm.token else Text("no", style="red")
@@ -389,17 +294,6 @@ def heat_bar(arm: ArmSnapshot) -> Text:
     return Text(bar(share, HEAT_CELLS) + _mark(arm.headroom_k), style=_headroom_style(arm.headroom_k))
 
 
-def plain_event(event: ArmEvent) -> str:
-    """An event in words, for example `joint 2 is above the warning limit (60.0 °C), crate_1`."""
-    words = PLAIN.get(event.kind, event.kind.replace("_", " "))
-    text = words.format(job=event.job or "its job", joint=event.joint)
-    if event.kind in ("warning", "fault") and event.value is not None:
-        text += f" ({event.value:.1f} °C)"
-    if event.job and "{job}" not in words:
-        text += f", {event.job}"
-    return f"{text}: {event.reason}" if event.reason and event.kind not in ("warning", "fault") else text
-
-
 def jobs_line(fleet: FleetSnapshot) -> Text:
     """Number of jobs in each state."""
     counts = ", ".join(f"{fleet.counts[state]} {state}" for state in get_args(JobState) if fleet.counts.get(state))
@@ -425,25 +319,6 @@ def alarm_line(fleet: FleetSnapshot) -> Text:
     return _line((f"alarms: {len(lasting) or 'none'}{last}", "bold red" if unseen else ""))
 
 
-def arm_line(arm: ArmSnapshot, *, joints: bool = False) -> str:
-    """An arm on one line; with `joints`, the temperature of every motor."""
-    scores = format_scores(arm)
-    parts = [
-        f"{arm.arm:<10}",
-        f"{arm.mode or 'unknown':<8}",
-        "" if arm.hottest_c is None else f"{arm.hottest_c:.1f} °C joint {arm.joint}",
-        "" if arm.headroom_k is None else f"headroom {arm.headroom_k:.1f} K",
-        "joints " + " ".join(f"{temp_c:.1f}" for temp_c in arm.temp_c) if joints else "",
-        f"job {arm.job}, {brief(arm.busy_s)} left" if arm.job and arm.busy_s else f"job {arm.job}" if arm.job else "",
-        format_motion(arm),
-        f"open jobs: {scores}" if scores else "",
-        f"state {format_age(arm.state_age_s)}",
-        "" if arm.token else "no token",
-        f"bad sensor: {arm.bad_sensor}" if arm.bad_sensor else "",
-    ]
-    return "  ".join(filter(None, parts))
-
-
 def format_scores(arm: ArmSnapshot) -> str:
     """Predicted peak, P and difficulty of the open jobs, coolest first; a dash for what the arm does not know."""
 
@@ -462,12 +337,14 @@ def format_scores(arm: ArmSnapshot) -> str:
     return "; ".join(parts)
 
 
-def format_motion(arm: ArmSnapshot) -> str:
-    """Difficulty of the executed motion, and the temperature that the hottest motor should have."""
-    parts = [] if arm.motion_difficulty is None else [f"motion d {arm.motion_difficulty:.2f}"]
-    if arm.expected_c and arm.joint:
+def format_work(arm: ArmSnapshot) -> str:
+    """Job, or difficulty of the executed motion and the temperature that the hottest motor should have; bad sensor."""
+    parts = [arm.job] if arm.job else []
+    if not arm.job and arm.motion_difficulty is not None:
+        parts.append(f"motion d {arm.motion_difficulty:.2f}")
+    if not arm.job and arm.expected_c and arm.joint:
         parts.append(f"joint {arm.joint} expected {arm.expected_c[arm.joint - 1]:.1f} °C")
-    return ", ".join(parts)
+    return ", ".join([*parts, *([f"bad sensor: {arm.bad_sensor}"] if arm.bad_sensor else [])])
 
 
 def format_age(seconds: float | None) -> str:
@@ -477,11 +354,6 @@ def format_age(seconds: float | None) -> str:
     if seconds < 10:
         return f"{max(0.0, seconds):.1f} s"
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
-
-
-def format_time(time_s: float) -> str:
-    """Fleet time: `1:02:03`."""
-    return clock(int(time_s))
 
 
 def _headroom_style(headroom_k: float | None) -> str:

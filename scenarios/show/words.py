@@ -1,6 +1,6 @@
 """Times, events and offers in words."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from typing import TYPE_CHECKING
 
@@ -8,6 +8,7 @@ from fleet.events import Event
 from scenarios.spec.calendar import date_at
 
 if TYPE_CHECKING:  # slow to import
+    from fleet.bus.protocol.auction import ArmEvent
     from scenarios.run.records import Offer
 
 SEVERITY = {
@@ -60,8 +61,8 @@ def kind_text(kind: str) -> str:
     return LABELS.get(kind, kind.replace("_", " "))
 
 
-def event_text(event: Event) -> str:
-    """An event in words."""
+def event_text(event: "Event | ArmEvent") -> str:
+    """An event in words, without its time and arm."""
     joint = f", joint {event.joint}" if event.joint else ""
     reason = f": {event.reason}" if event.reason else ""
     return f"{event.kind.replace('_', ' ')}{f' {event.job}' if event.job else ''}{joint}{reason}"
@@ -77,3 +78,8 @@ def offer_text(offer: "Offer") -> str:
     parts.append(f"{(offer.duration_s or 0.0) / 60:.0f} min")
     barred = "" if offer.free else f" ({offer.state if offer.state != 'idle' else 'place or space taken'})"
     return ", ".join(parts) + barred
+
+
+def offers_text(offers: "Iterable[Offer]") -> str:
+    """Offers of several arms in one sentence."""
+    return "; ".join(f"{offer.arm}: {offer_text(offer)}" for offer in offers)

@@ -14,7 +14,7 @@ from fleet.live.monitor.snapshot import FleetView
 from fleet.live.sensors import ArmSensors
 from fleet.readings import TemperatureFilter
 from fleet.robot import JOINTS
-from scenarios.show.watch import arm_line
+from scenarios.show.watch import format_work
 
 GOOD_C = (30.0, 41.0, 33.0, 38.0, 31.0, 40.0, 39.0)
 
@@ -111,7 +111,7 @@ def test_people_see_the_bad_sensor():
     view.update("arm", state(2, 0.0), 0.1)
     (arm,) = view.snapshot(0.2).arms
     assert (arm.present, arm.hottest_c, arm.joint, arm.mode) == (True, 41.0, 2, "idle")
-    assert "bad sensor: joint 2 reads 0.0 °C" in arm_line(arm)
+    assert "bad sensor: joint 2 reads 0.0 °C" in format_work(arm)
     (finding,) = check_arm(arm, None)
     assert finding.level == "warning"
     assert "arm has impossible temperatures: joint 2 reads 0.0 °C" in finding.what

@@ -22,14 +22,13 @@ from rich.console import Console
 from scipy import stats
 
 from fleet.bus.exchange.channel import PERFECT, Channel
-from fleet.difficulty import KNOWN, Difficulty, Forecast
 from fleet.errors import FleetError
 from scenarios.cli import options
 from scenarios.evaluate import runner
 from scenarios.evaluate.comparison import Comparison, compare, comparisons, figures_table, scores_over_all
 from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
 from scenarios.evaluate.scores import Shift
-from scenarios.evaluate.sources import _Random, inverted
+from scenarios.evaluate.sources import _Random
 from scenarios.evaluate.statistics import Figure
 from scenarios.evaluate.store import read_rows
 from scenarios.evaluate.study import Case, Row, RowKey, Study
@@ -366,27 +365,14 @@ def test_the_command_line_has_what_is_no_default():
     assert told[1] == "thermofleet compare a"
 
 
-def plan(profile: np.ndarray) -> SimpleNamespace:
-    return SimpleNamespace(arm="a", cycle=SimpleNamespace(profile=profile))
-
-
 def test_random_scores_are_uniform_and_repeat() -> None:
     rng, scores = np.random.default_rng(0), _Random(3)
-    plans = [plan(rng.standard_normal((20, 3, 7))) for _ in range(400)]
+    cycles = [SimpleNamespace(profile=rng.standard_normal((20, 3, 7))) for _ in range(400)]
+    plans = [SimpleNamespace(arm="a", cycle=cycle) for cycle in cycles]
     drawn = np.array([[*score.per_joint, score.p_saturation] for score in (scores.score(each, 4) for each in plans)])
     assert stats.kstest(drawn.ravel(), "uniform").pvalue > 0.01
     assert scores.score(plans[0], 4).per_joint.tolist() == drawn[0, :7].tolist()
     assert _Random(4).score(plans[0], 4).per_joint.tolist() != drawn[0, :7].tolist()
-
-
-def test_the_inverse_has_the_opposite_order_and_probability() -> None:
-    risk = Forecast(np.array([-3.0]), np.full((1, KNOWN), 0.05))
-    hard = SimpleNamespace(version="v", score=lambda *_: Difficulty(np.linspace(0.0, 0.9, 7), risk=risk))
-    opposite, known_c = inverted(hard).score(plan(np.zeros((2, 3, 7))), 1), np.full(KNOWN, 30.0)
-    assert opposite is not None
-    assert opposite.per_joint == pytest.approx(np.linspace(1.0, 0.1, 7))
-    assert (opposite.per_joint < 1.0).all()
-    assert opposite.p_at(known_c) == pytest.approx(1.0 - risk.at(known_c))
 
 
 def rewards_of(text: str) -> dict[str, list[float]]:
@@ -401,13 +387,11 @@ def rewards_of(text: str) -> dict[str, list[float]]:
 
 
 QUICK = rewards_of("""
-wspt@rc-nominal
-    5.99749417852418 8.997540478131903 5.997348023627421 8.997400913679169
 wspt@random
     5.997495397180928 8.997542830431069 5.99749417852418 8.997541705519062
     5.99734675079658 8.997398132164946 5.99734675079658 8.997398382846647
-wspt@constant
-    5.99749417852418 8.997540225994873 5.997348023627421 8.997401117223173
+wspt@rc-nominal
+    5.99749417852418 8.997540478131903 5.997348023627421 8.997400913679169
 wspt@blind
     5.99749417852418 8.997540225994873 5.997348023627421 8.997401117223173
 wspt@oracle
@@ -430,13 +414,8 @@ wspt@untrained
     5.99734675079658 8.99739964131719 5.99734675079658 8.997398383369463
 wspt@torque
     5.997495397180928 8.9975423294294 5.99734675079658 8.997398132164946
-wspt@weighted-torque
-    5.99749417852418 8.997540225994873 5.997348023627421 8.997401117223173
 wspt@rc
     5.99749417852418 8.997540225994873 5.997348023627421 8.997401117223173
-wspt@inverted
-    5.99749417852418 8.997541466873425 5.99749417852418 8.997541961857248
-    5.997348023627421 8.997399875725273 5.997348023627421 8.997399651469813
 least_difficulty@rc
     5.9974948357982685 8.997541818562766 5.997347333903775 8.997399587617933
 """)
@@ -476,13 +455,13 @@ def test_trained_sources_have_the_rewards_that_they_always_had(thermofleet, smal
 def test_a_comparison_of_sources_resumes(thermofleet, small_toml, tmp_path, monkeypatch) -> None:
     out = tmp_path / "sources"
     how = ("--fleets", 2, "--trainings", 2, "--first-seed", 10_000, "--workers", 1)
-    names = ("--policies", "wspt,round_robin@blind", "--difficulty", "blind,random,constant,oracle")
+    names = ("--policies", "wspt,round_robin@blind", "--difficulty", "blind,rc-nominal,random,oracle")
     call = ("compare", small_toml, *names, *how, "--out", out)
     done = thermofleet(*call, "--seeds", 2)
     assert done.code == 0, done.err
-    for name in ("wspt@blind", "wspt@random", "wspt@constant", "wspt@oracle", "round_robin@blind"):
+    for name in ("wspt@blind", "wspt@rc-nominal", "wspt@random", "wspt@oracle", "round_robin@blind"):
         assert done.out.count(f"  {name} ") == 1 + len(FIGURES)  # its scope, and each figure
-    assert len(read_rows(out)) == 2 * 2 * (1 + 2 + 1 + 1 + 1)  # random numbers have two trainings
+    assert len(read_rows(out)) == 2 * 2 * (1 + 1 + 2 + 1 + 1)  # random numbers have two trainings
     again = thermofleet(*call, "--seeds", 2, "--json")
     alone = thermofleet("compare", small_toml, "--policies", "round_robin", "--difficulty", "blind", *how, "--seeds", 2,
                         "--json")  # fmt: skip

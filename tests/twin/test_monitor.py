@@ -14,7 +14,7 @@ from fleet.bus.router import Router
 from fleet.live.arm.body import ReplayBody, SensorLog
 from fleet.live.monitor.snapshot import ArmSnapshot
 from scenarios.live.arm import replayed_arm
-from scenarios.show.watch import arm_line
+from scenarios.show.watch import format_work
 from tests.commands import start
 from tests.twin.test_follow import csv_of, log_of
 from tests.twin.test_identify import AIR_C, working
@@ -107,4 +107,4 @@ def test_a_replayed_arm_publishes_d_and_expected_temperatures(twin, motion, tmp_
     assert infos[-1].twin == f"d:{twin.version}+temperatures:{network.version}"
     assert 0 < (states[-1].motion_difficulty or 0) < 7
     shown = ArmSnapshot("a", True, True, joint=2, motion_difficulty=1.25, expected_c=(30.0, 41.5))
-    assert "motion d 1.25, joint 2 expected 41.5 °C" in arm_line(shown)
+    assert "motion d 1.25, joint 2 expected 41.5 °C" in format_work(shown)

@@ -5,7 +5,6 @@ import shutil
 import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -76,14 +75,14 @@ def test_the_cell_is_drawn_and_moves_with_the_clock(page: Page, run_folder: Path
 
 
 def test_the_cursor_of_the_figure_and_the_clock_are_one(page: Page) -> None:
-    figure = page.locator("#figure .draglayer .nsewdrag").first
+    figure = page.locator(".chart .draglayer .nsewdrag").first
     figure.scroll_into_view_if_needed()
     box = figure.bounding_box()
     assert box is not None
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     hours, minutes, seconds = map(int, page.locator("#clock").inner_text().split(":"))
     assert 3600 * hours + 60 * minutes + seconds == pytest.approx(3600, abs=30)  # the middle of two hours
-    cursor = page.locator("#figure .cursor").bounding_box()
+    cursor = page.locator(".chart .cursor").first.bounding_box()
     assert cursor is not None
     assert cursor["x"] == pytest.approx(box["x"] + box["width"] / 2, abs=3)
 
@@ -142,14 +141,12 @@ def test_a_narrow_page_overprints_nothing(page: Page, width: int) -> None:
     page.reload()
     page.wait_for_selector("body[data-ready]", timeout=300_000)
     page.wait_for_timeout(500)
-    boxes = [
-        page.locator(f"#figure .{name}").first.bounding_box() for name in ("legend", "xaxislayer-above", "legend2")
-    ]
-    assert all(boxes)
-    for above, below in pairwise(boxes):
-        assert above is not None
-        assert below is not None
-        assert above["y"] + above["height"] <= below["y"] + 1
+    assert page.locator(".chart").count() == 2
+    for chart in page.locator(".chart").all():
+        legend, plot = (chart.locator(name).first.bounding_box() for name in (".legend", ".draglayer .nsewdrag"))
+        assert legend is not None
+        assert plot is not None
+        assert legend["y"] + legend["height"] <= plot["y"] + 1
     overflow = page.locator("html").evaluate("e => e.scrollWidth - e.clientWidth")
     assert overflow <= 0
 
@@ -166,7 +163,7 @@ def test_words_have_contrast_in_light_and_dark(browser: Browser, run_folder: Pat
         page = browser.new_page(color_scheme=scheme)  # pyright: ignore[reportArgumentType]
         page.goto((run_folder / "report.html").as_uri())
         page.wait_for_selector("body[data-ready]", timeout=300_000)
-        for selector in ("h1", ".verdict", ".faint", ".status", "#events td", "#figure .ytick text"):
+        for selector in ("h1", ".verdict", ".faint", ".status", "#events td", ".chart .ytick text"):
             colours = page.locator(selector).first.evaluate(COLOURS)
             ink, paper = (
                 luminance(np.array([int(x) for x in c[c.index("(") + 1 :].rstrip(")").split(",")[:3]])) for c in colours

@@ -10,12 +10,12 @@ function startFilters() {
   });
 }
 
-// Draws every element with `data-drawn` from the JSON in the element of that id; returns the first.
+// Draws every element with `data-drawn` from the JSON in the element of that id; returns all.
 async function drawFigures(options) {
   await runLibrary("plotly");
   const elements = [...document.querySelectorAll("[data-drawn]")];
   for (const element of elements) await drawFigure(element, options);
-  return elements[0];
+  return elements;
 }
 
 async function drawFigure(element, options) {
@@ -48,16 +48,12 @@ async function drawFigure(element, options) {
     const legend = element.querySelector(".legend");
     if (!legend || element.clientWidth === last) return;
     last = element.clientWidth;
-    const shift = drawn.layout.xaxis2; // of a shift: the time axis of the work has the title of the one below
     const narrow = last < 600;
     if (narrow || element.layout.margin.l !== room.l) await Plotly.relayout(element, sides(narrow));
-    const needed = element.querySelector(".legend").getBoundingClientRect().height + (shift ? 50 : 20);
+    const needed = element.querySelector(".legend").getBoundingClientRect().height + 20;
     const margin = Math.max(room.t, Math.ceil(needed));
-    if ((shift && narrow) || Math.abs(margin - element.layout.margin.t) > 4)
-      await Plotly.relayout(element, {
-        "margin.t": margin, height: drawn.layout.height + margin - room.t,
-        ...(shift && { "legend2.font.size": narrow ? 9 : 12, "xaxis.title.text": narrow ? "" : shift.title.text }),
-      });
+    if (Math.abs(margin - element.layout.margin.t) > 4)
+      await Plotly.relayout(element, { "margin.t": margin, height: drawn.layout.height + margin - room.t });
   }
   await fit();
   element.on("plotly_afterplot", fit);

@@ -45,7 +45,7 @@ async function startReplay(unitS, begin) {
     shift.place.className = "cell absent";
     shift.place.textContent = "This browser cannot draw in 3-D (WebGL is missing). The figures below show the same shift.";
   }
-  let timeS = beginS, playing = false, last = 0, figure = null, moveCursor = null;
+  let timeS = beginS, playing = false, last = 0, lanes = null, cursors = [];
   slider.min = beginS;
   slider.max = endS;
   slider.step = "any";
@@ -60,7 +60,7 @@ async function startReplay(unitS, begin) {
     clock.textContent = text;
     slider.setAttribute("aria-valuetext", text);
     shifts.forEach(showShift);
-    if (moveCursor) moveCursor(timeS);
+    for (const move of cursors) move(timeS);
   }
   function showShift(shift) {
     const { data, cell, modes } = shift, lines = [];
@@ -98,7 +98,7 @@ async function startReplay(unitS, begin) {
     play.textContent = playing ? "❚❚" : "▶";
     play.setAttribute("aria-label", playing ? "pause" : "play");
   }
-  // A vertical line over the whole figure; a click in the figure moves it.
+  // A vertical line over a whole figure; a click in the figure moves it.
   function addCursor(element) {
     const line = document.createElement("div");
     line.className = "cursor";
@@ -119,14 +119,14 @@ async function startReplay(unitS, begin) {
   function choose(arm) {
     chooser.value = arm;
     for (const { cell } of shifts) if (cell) cell.focus(arm);
-    const lane = figure && figure.layout.meta;
-    if (!lane || arm < 0) return;
+    if (!lanes || arm < 0) return;
+    const lane = lanes.layout.meta;
     const { moments, first_s, step_s, values, scale } = first.temp_c, xs = Array.from({ length: moments }, (_, i) => (first_s + i * step_s) / unitS);
     const ys = Array.from({ length: joints }, (_, j) => xs.map((_, i) => values[(arm * joints + j) * moments + i] * scale));
-    Plotly.restyle(figure, { x: ys.map(() => xs), y: ys }, lane.lane_traces);
+    Plotly.restyle(lanes, { x: ys.map(() => xs), y: ys }, lane.lane_traces);
     const name = document.createElement("b");
     name.textContent = model.arms[arm].name;
-    Plotly.relayout(figure, { [`annotations[${lane.lane_title}].text`]: name.outerHTML });
+    Plotly.relayout(lanes, { [`annotations[${lane.lane_title}].text`]: name.outerHTML });
   }
   model.arms.forEach((arm, i) => chooser.append(new Option(arm.name, i)));
   chooser.addEventListener("change", () => choose(Number(chooser.value)));
@@ -152,15 +152,24 @@ async function startReplay(unitS, begin) {
     else return;
     event.preventDefault();
   });
-  function attach(element) {
-    figure = element;
-    figure.on("plotly_click", (event) => {
-      const point = event.points[0];
-      if (point.data.type === "heatmap") choose(point.y);
-    });
-    moveCursor = addCursor(figure);
+  // Figures over the time of the shift: a cursor in each, and a zoom of one zooms all.
+  function attach(figures) {
+    lanes = figures.find((one) => one.layout.meta);
+    let zooming = false;
+    for (const figure of figures) {
+      figure.on("plotly_click", (event) => {
+        if (event.points[0].data.type === "heatmap") choose(event.points[0].y);
+      });
+      figure.on("plotly_relayout", async (change) => {
+        if (zooming || !Object.keys(change).some((key) => key.startsWith("xaxis."))) return;
+        zooming = true;
+        for (const other of figures) if (other !== figure) await Plotly.relayout(other, { "xaxis.range": [...figure.layout.xaxis.range] });
+        zooming = false;
+      });
+    }
+    cursors = figures.map(addCursor);
     if (chooser.value >= 0) choose(Number(chooser.value));
-    moveCursor(timeS);
+    for (const move of cursors) move(timeS);
   }
   show(timeS);
   requestAnimationFrame(frame);
