@@ -75,7 +75,8 @@ def plan_page(scenario: Scenario, report: LayoutReport) -> str:
         "fixtures": [outline.tolist() for fixture in scenario.fixtures for outline in outlines(fixture)],
     }
     drag = "Drag an arm by its base, or turn it by the tip of its arrow; with the arrow keys it moves by 1 cm."
-    head = Head(remarks=(f"{drag} The {LEGEND.format(height_m)}.",), badges=[Badge(problem, good=False) for problem in report.problems])
+    problems = [Badge(problem, good=False) for problem in report.problems]
+    head = Head(remarks=(f"{drag} The {LEGEND.format(height_m)}.",), badges=problems)
     cell = Section(key="cell", title="Cell", html=render("layout.html"))
     return Page(title=f"Plan of {scenario.name}", sections=[cell], head=head, plan=plan, narrow=False).html()
 
