@@ -1,6 +1,5 @@
 """Errors of the environment: each says what was given, what is allowed, and what to do."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,9 +12,6 @@ from scenarios.prepare.fleet import Randomisation, make_env
 
 MAKERS = (make_env, lambda scenario, **options: make_batch(scenario, 2, **options))
 NO_SEEDS = (-1, 1.5, "a", True, [1, 2], np.array([1, 2]), np.array(3.0))
-
-
-# The single environment
 
 
 def test_actions_may_be_numpy_integers(make, play) -> None:
@@ -120,9 +116,6 @@ def test_the_aec_env_refuses_wrong_actions(small) -> None:
     assert first not in env.agents
 
 
-# The batch
-
-
 @pytest.mark.parametrize(
     "actions",
     [
@@ -215,9 +208,6 @@ def test_num_envs_and_max_cycles_must_be_positive(batch, count) -> None:
             batch(2, max_cycles=count)
 
 
-# Scenarios
-
-
 def beyond(cell) -> dict[str, Any]:
     """Return the cell with its shelf out of reach."""
     places = [{"name": p.name, "position_m": list(p.position_m)} for p in cell.places]
@@ -230,18 +220,6 @@ def test_jobs_that_no_arm_can_do_are_refused_with_a_remedy(cell, plans) -> None:
     for make in MAKERS:
         with pytest.raises(ScenarioError, match=message):
             make(cell, difficulty="blind", cache=plans, **beyond(cell))
-
-
-def test_unknown_scenarios_and_fields_are_refused(cell, plans) -> None:
-    for make in MAKERS:
-        with pytest.raises(ScenarioError, match="No scenario 'quickstrat'; did you mean 'quickstart'"):
-            make("quickstrat")
-        with pytest.raises(ScenarioError, match=r"There is no scenario file '.*none\.toml'"):
-            make(Path("none.toml"))
-        with pytest.raises(ScenarioError, match=r"unknown key 'horizon'; did you mean 'horizon_s'"):
-            make(cell, difficulty="blind", cache=plans, horizon=60)
-        with pytest.raises(ScenarioError, match="No difficulty 'twins'; did you mean 'twin'"):
-            make(cell, difficulty="twins", cache=plans)
 
 
 def test_unknown_overrides_are_refused_with_the_nearest_name(cell, plans) -> None:
@@ -333,19 +311,13 @@ def test_invalid_ambient_temperatures_are_refused(cell, plans, warmer_k) -> None
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            {"ambient_k": (2.0, 1.0)},
-            r"Randomisation\.ambient_k must be two finite numbers, low <= high \(got \(2\.0, 1\.0\)\)",
-        ),
+        ({"ambient_k": (2.0, 1.0)}, r"Randomisation\.ambient_k must be two finite numbers, low <= high \(got \(2\.0,"),
         ({"arrivals": (2.0, 1.0)}, r"Randomisation\.arrivals must be two finite numbers, low <= high"),
         ({"arrivals": (0.0, 1.0)}, r"Randomisation\.arrivals must be > 0"),
         ({"ambient_k": (0.0, float("inf"))}, r"Randomisation\.ambient_k must be two finite numbers"),
         ({"ambient_k": 3.0}, r"Randomisation\.ambient_k must be two finite numbers, .* \(got 3\.0\)"),
         ({"arrivals": (float("nan"), 1.0)}, r"Randomisation\.arrivals must be two finite numbers"),
-        (
-            {"arrivals": (1.0, 1e9)},
-            r"Randomisation\.arrivals must be > 0 and at most 100 \(got \(1\.0, 1000000000\.0\)\)",
-        ),
+        ({"arrivals": (1.0, 1e9)}, r"Randomisation\.arrivals must be > 0 and at most 100 \(got \(1\.0, 1000000000\.0"),
         ({"arrivals": None}, r"Randomisation\.arrivals must be two finite numbers, .* \(got None\)"),
         ({"ambient_k": ("a", "b")}, r"Randomisation\.ambient_k must be two finite numbers, .* \(got \('a', 'b'\)\)"),
         ({"variants": 3}, r"Randomisation\.variants must be a list of dictionaries, .+ \(got 3\)"),
