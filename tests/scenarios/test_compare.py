@@ -8,7 +8,6 @@ import json
 import math
 import re
 import shlex
-from collections.abc import Iterable
 from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -57,17 +56,6 @@ def printed(result: Comparison) -> str:
     page = io.StringIO()
     Console(file=page, width=80).print(result.table)
     return page.getvalue()
-
-
-@pytest.mark.ci_slow
-@pytest.mark.parametrize("channel", [PERFECT, Channel(topology="line", delay_s=10.0)], ids=["perfect", "late"])
-def test_the_result_does_not_depend_on_the_number_of_workers(scenario, plans, monkeypatch, channel):
-    how = {"seeds": range(6), "channel": channel}
-    alone = compared(scenario, plans, workers=1, **how)
-    monkeypatch.setattr("scenarios.evaluate.study.TOGETHER", 4)
-    assert compared(scenario, plans, workers=1, **how) == alone
-    monkeypatch.setattr("scenarios.evaluate.runner.HERE_S", 0.0)
-    assert compared(scenario, plans, workers=2, **how) == alone
 
 
 def test_a_scenario_is_a_file_too_and_the_first_policy_the_default_baseline(small_toml, scenario, plans):
@@ -387,89 +375,6 @@ def test_the_inverse_has_the_opposite_order_and_probability() -> None:
     assert opposite.per_joint == pytest.approx(np.linspace(1.0, 0.1, 7))
     assert (opposite.per_joint < 1.0).all()
     assert opposite.p_at(known_c) == pytest.approx(1.0 - risk.at(known_c))
-
-
-def rewards_of(text: str) -> dict[str, list[float]]:
-    """The rewards of each POLICY@SOURCE in a text of names, each with its numbers after it."""
-    found: dict[str, list[float]] = {}
-    for word in text.split():
-        if "@" in word:
-            numbers = found[word] = []
-        else:
-            numbers.append(float(word))
-    return found
-
-
-QUICK = rewards_of("""
-wspt@rc-nominal
-    5.99749417852418 8.997540478131903 5.997348023627421 8.997400913679169
-wspt@random
-    5.997495397180928 8.997542830431069 5.99749417852418 8.997541705519062
-    5.99734675079658 8.997398132164946 5.99734675079658 8.997398382846647
-wspt@constant
-    5.99749417852418 8.997540225994873 5.997348023627421 8.997401117223173
-wspt@blind
-    5.99749417852418 8.997540225994873 5.997348023627421 8.997401117223173
-wspt@oracle
-    5.99749417852418 8.997540225994873 5.997348023627421 8.997401117223173
-round_robin@blind
-    5.997494576202657 8.997540477589707 5.9973476880432175 8.997400912449335
-""")
-"""Rewards of the small scenario with seeds 10000 and 10001, of each of two fleets and two trainings, as an earlier
-implementation, `thermofleet ablate`, computed them in float64."""
-
-TRAINED = rewards_of("""
-wspt@trained
-    5.997495397180928 8.997542830431069 5.997495397180928 8.997541460698054
-    5.99734675079658 8.997398383369463 5.99734675079658 8.997398629429464
-wspt@unweighted
-    5.997495397180928 8.997543052291434 5.997495397180928 8.997543052291434
-    5.99734675079658 8.997398132164946 5.99734675079658 8.997398132164946
-wspt@untrained
-    5.99749417852418 8.997540478131903 5.997495397180928 8.99754169904697
-    5.99734675079658 8.99739964131719 5.99734675079658 8.997398383369463
-wspt@torque
-    5.997495397180928 8.9975423294294 5.99734675079658 8.997398132164946
-wspt@weighted-torque
-    5.99749417852418 8.997540225994873 5.997348023627421 8.997401117223173
-wspt@rc
-    5.99749417852418 8.997540225994873 5.997348023627421 8.997401117223173
-wspt@inverted
-    5.99749417852418 8.997541466873425 5.99749417852418 8.997541961857248
-    5.997348023627421 8.997399875725273 5.997348023627421 8.997399651469813
-least_difficulty@rc
-    5.9974948357982685 8.997541818562766 5.997347333903775 8.997399587617933
-""")
-
-
-def rewards(thermofleet, file: Path, out: Path, names: Iterable[str]) -> dict[str, list[float]]:
-    """The rewards of each POLICY@SOURCE, in the order of `QUICK`."""
-    how = ("--fleets", 2, "--trainings", 2, "--seeds", 2, "--first-seed", 10_000, "--out", out)
-    done = thermofleet("compare", file, "--policies", ",".join(names), *how)
-    assert done.code == 0, done.err
-    found: dict[str, list[float]] = {}
-    for row in read_rows(out):
-        assert row.outcome is not None
-        found.setdefault(f"{row.key.policy}@{row.key.difficulty}", []).append(row.outcome.reward)
-    return found
-
-
-def assert_alike(found: dict[str, list[float]], expected: dict[str, list[float]]) -> None:
-    """Assert that rewards are equal up to the rounding of energies in float32."""
-    assert found.keys() == expected.keys()
-    for name, values in expected.items():
-        assert found[name] == pytest.approx(values, rel=1e-10), name
-
-
-@pytest.mark.ci_slow
-def test_sources_have_the_rewards_that_they_always_had(thermofleet, small_toml, tmp_path) -> None:
-    assert_alike(rewards(thermofleet, small_toml, tmp_path / "out", QUICK), QUICK)
-
-
-@pytest.mark.slow
-def test_trained_sources_have_the_rewards_that_they_always_had(thermofleet, small_toml, tmp_path) -> None:
-    small_toml.write_text(f'{small_toml.read_text()}\n[twin]\nsize = "quick"\n')
-    assert_alike(rewards(thermofleet, small_toml, tmp_path / "out", TRAINED), TRAINED)
 
 
 @pytest.mark.ci_slow

@@ -34,6 +34,7 @@ from scenarios.spec.options import RunSpec
 from scenarios.spec.parse import override, parse_scenario
 from scenarios.spec.schema import Ambient, RewardSpec
 from scenarios.suite.splits import manifest
+from tests.scenarios.conftest import SMALL
 
 SEEDS = (0, 3, 12)
 LATE = Channel(delay_s=25.0, loss=0.3)
@@ -69,9 +70,8 @@ class Undecided(Restless):
 def fleet(request, plans: Path, tmp_path_factory: pytest.TempPathFactory) -> Fleet:
     """Two seconds of planning each; difficulties are the true ones."""
     if request.param == "small":
-        text = (Path(__file__).parent / "conftest.py").read_text(encoding="utf-8").split('SMALL = """')[1]
         path = tmp_path_factory.mktemp("small") / "small.toml"
-        path.write_text(text.split('"""')[0], encoding="utf-8")
+        path.write_text(SMALL, encoding="utf-8")
         return prepare(load(path), difficulty="blind", cache=plans)
     return request.getfixturevalue(request.param)
 
