@@ -74,6 +74,12 @@ def test_random_places_are_uniform_in_the_unit_square():
     assert abs(np.mean(hits) - expected) < 4 * np.sqrt(expected * (1 - expected) / 3000)
 
 
+def test_a_partition_of_unknown_arms_is_refused():
+    channel = Channel(partitions=(Partition(0.0, 1.0, (("arm_a",),)),))
+    with pytest.raises(ValueError, match=r"A partition names an unknown arm 'arm_a'.*Allowed: a, b"):
+        channel.check(FIVE)
+
+
 def test_a_partition_cuts_what_lies_between_groups_and_those_of_no_group_keep_together():
     cut = Partition(0.0, 1.0, (("a", "b"), ("c",))).cuts(FIVE)
     together = [{"a", "b"}, {"c"}, {"d", "e"}]
