@@ -1,5 +1,6 @@
 """Errors of the environment: each says what was given, what is allowed, and what to do."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -220,6 +221,18 @@ def test_jobs_that_no_arm_can_do_are_refused_with_a_remedy(cell, plans) -> None:
     for make in MAKERS:
         with pytest.raises(ScenarioError, match=message):
             make(cell, difficulty="blind", cache=plans, **beyond(cell))
+
+
+def test_unknown_scenarios_and_fields_are_refused(cell, plans) -> None:
+    for make in MAKERS:
+        with pytest.raises(ScenarioError, match="No scenario 'quickstrat'; did you mean 'quickstart'"):
+            make("quickstrat")
+        with pytest.raises(ScenarioError, match=r"There is no scenario file '.*none\.toml'"):
+            make(Path("none.toml"))
+        with pytest.raises(ScenarioError, match=r"unknown key 'horizon'; did you mean 'horizon_s'"):
+            make(cell, difficulty="blind", cache=plans, horizon=60)
+        with pytest.raises(ScenarioError, match="No difficulty 'twins'; did you mean 'twin'"):
+            make(cell, difficulty="twins", cache=plans)
 
 
 def test_unknown_overrides_are_refused_with_the_nearest_name(cell, plans) -> None:
