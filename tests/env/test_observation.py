@@ -14,7 +14,7 @@ from fleet.bus.exchange.memory import UNHEARD, Exchange, PeerView
 from fleet.difficulty import Forecast
 from fleet.engine.batch import Engine, Parts, RewardWeights, empty_parts
 from fleet.engine.profile_plant import sensor_noise
-from fleet.engine.shift import Episode, broadcast, initial, write_members
+from fleet.engine.shift import Episode, broadcast, initial, step, write_members
 from fleet.engine.state import State
 from fleet.engine.world import World
 from fleet.env.allocation_v2 import parallel_env
@@ -366,11 +366,7 @@ def test_vectors_equal_the_reference(small, play, draft, two_plans, data) -> Non
 def test_shifts_of_the_comparison_include_faults_returned_jobs_and_closed_space(small, play) -> None:
     limits = ThermalLimits(warning_c=56.0, error_c=60.0, restart_c=54.0, clear_s=25.0)
     make = small.Shifts(arms=3, jobs=9, ticks=80, ambient_c=45.0, limits=limits, crowding=0.3, absences=7)
-    options = [{"scaled": scaled, "ahead_s": ahead_s} for scaled in (False, True) for ahead_s in (np.inf, 11.5)]
-    played = [
-        compare_with_reference(play, make(np.random.SeedSequence(seed)), seed, **each)
-        for seed, each in enumerate(options)
-    ]
+    played = [compare_with_reference(play, make(np.random.SeedSequence(seed)), seed) for seed in range(4)]
     last = [state for state, _ in played]
     assert sum(closed for _, closed in played) > 0
     assert sum(int(state.faults.sum()) for state in last) > 0
@@ -399,6 +395,49 @@ def test_messages_that_arrive_at_once_give_what_the_arms_know_of_each_other(smal
     compare_with_reference(
         play, make(np.random.SeedSequence(4)), 4, Exchange(("arm_0", "arm_1", "arm_2"), never), near=near, bids=True
     )
+
+
+def test_options_of_arms_that_are_home_later_are_zero_and_others_unchanged(small, play) -> None:
+    episode, rng = (
+        small.Shifts(arms=3, jobs=9, ticks=60, crowding=0.3)(np.random.SeedSequence(2)),
+        np.random.default_rng(2),
+    )
+    world, ahead_s = episode.world, 11.5
+    whole, some = (Single(episode, ahead_s=each) for each in (np.inf, ahead_s))
+    layout = whole.layout
+    hidden = shown = 0
+    while whole.tick < world.ticks:
+        one, other = (layout.read_parts(*runner.parts, runner.mask) for runner in (whole, some))
+        late = one.busy_s > ahead_s
+        for name, values in play.named(one).items():
+            if name in ("duration_s", "difficulty", "p_saturation", "peak_c", "blocked"):
+                hidden, shown = hidden + int((values[late] != 0).sum()), shown + int((values[~late] != 0).sum())
+                values = np.where(late[:, None], 0.0, values)
+            np.testing.assert_array_equal(getattr(other, name), values, err_msg=name)
+        actions = play.chosen(whole.mask, rng.random((3, 2)))
+        whole.step(actions), some.step(actions)
+    assert min(hidden, shown) > 50
+
+
+@pytest.mark.parametrize("near", [None, ((2,), (0,), (1,))])
+def test_scaled_values_times_their_scales_are_the_values(small, play, near) -> None:
+    """Exactly: scales are powers of two."""
+    content = [small.work(place, payload) for place in ("a", "b") for payload in (small.LIGHT, small.HOT)]
+    arms = [small.arm(a, content, model=play.Learned(2, curve=True)) for a in range(3)]
+    jobs = [small.job(f"j{i}", content[i % 4], release_s=50.0 * (i % 3)) for i in range(6)]
+    world, plant = small.shop([jobs], arms=arms, ticks=50, space=small.crowded(0.3))
+    episode, rng = Episode(world, plant, ("t",) * 3, np.random.SeedSequence(1)), np.random.default_rng(1)
+    plain, scaled = (Single(episode, near=near, scaled=each) for each in (False, True))
+    layout = scaled.layout
+    for _ in range(world.ticks):
+        vectors = layout.join(*scaled.parts)
+        np.testing.assert_array_equal(vectors * layout.scales, layout.join(*plain.parts))
+        assert np.abs(vectors).max() < 30.0  # of order 1
+        one, other = plain.layout.read_parts(*plain.parts, plain.mask), layout.read(vectors, scaled.mask)
+        for name, values in play.named(one).items():
+            np.testing.assert_array_equal(getattr(other, name), values, err_msg=name)
+        actions = play.chosen(plain.mask, rng.random((3, 2)))
+        plain.step(actions), scaled.step(actions)
 
 
 NO_NOISE = replace(gen3_motors(), sensor_noise_k=np.zeros(7))
@@ -445,6 +484,9 @@ def observe(world: World, state: State, **options) -> Observation:
     """Return the observations in a state, leading axes [env, arm]."""
     engine, parts = engine_at(world, state, **options)
     return engine.layout.read_parts(*parts, engine.mask)
+
+
+# Single fields
 
 
 def test_peers_are_the_others_in_order() -> None:
@@ -562,6 +604,28 @@ def test_jobs_that_share_a_station_have_the_group_of_the_first(small) -> None:
     assert observed.station_free[0].tolist() == [[1] * 5 + [0]] * 2
 
 
+def test_a_job_is_blocked_for_an_arm_whose_fastest_plan_needs_taken_space(small) -> None:
+    """`blocked` follows from the volumes of the plans of arms away from home; an arm does not block itself."""
+    bench, rack = small.work("bench"), small.work("rack")
+    arms = [small.arm(i, [bench, rack]) for i in range(3)]
+    jobs = [small.job("a", bench), small.job("b", rack), small.job("c", rack)]
+
+    def excluding(plans) -> tuple[np.ndarray, np.ndarray]:
+        one = [plan.arm == "arm_0" and plan.work == bench for plan in plans]
+        other = [plan.arm == "arm_1" and plan.work == rack for plan in plans]
+        conflicts = np.outer(one, other) | np.outer(other, one)
+        return np.arange(len(plans)), conflicts
+
+    world, plant = small.shop([jobs], arms=arms, slots=3, space=excluding)
+    before = initial(world)
+    assert not observe(world, before).blocked.any()
+    after = step(world, before, np.array([[1, 0, 0]]), plant, compiled=False).state
+    assert after.mode[0].tolist() == [WORKING, IDLE, IDLE]
+    observed = observe(world, after)
+    assert observed.blocked[0].tolist() == [[0, 0, 0], [1, 1, 0], [0, 0, 0]]
+    assert observed.action_mask[0].tolist() == [[1, 0, 0, 0, 1], [1, 0, 0, 0, 0], [1, 1, 1, 0, 0]]
+
+
 def test_an_arm_broadcasts_what_it_measures_and_its_scores(small) -> None:
     content = small.work()
     arms = [small.arm(i, [content], motors=NO_NOISE) for i in range(2)]
@@ -580,6 +644,9 @@ def test_an_arm_broadcasts_what_it_measures_and_its_scores(small) -> None:
     assert message.p_saturation[:, 0] == pytest.approx(world.tables.work["p_saturation"][0, 0])
     assert np.isnan(message.difficulty[:, 1:]).all()
     assert np.isnan(message.p_saturation[:, 1:]).all()
+
+
+# Peers and sensors in an episode
 
 
 def test_a_delayed_message_is_as_old_as_its_delay(small) -> None:
