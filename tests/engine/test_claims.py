@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from fleet.engine.shift import initial, open_jobs, step
 from fleet.engine.world import World
-from fleet.telemetry import IDLE
+from fleet.telemetry import IDLE, WORKING
 from tests.profiles import examples
 from tests.shifts import with_conflicts, with_tables, with_work
 
@@ -119,6 +119,17 @@ def test_awards_equal_the_reference(small, data) -> None:
         assert after.plan[0].tolist() == [-1 if j < 0 else plan[a, j, chosen[a]] for a, j in enumerate(expected)]
         assert after.job[0].tolist() == expected
         state = after
+
+
+def test_a_score_beats_no_score_and_the_lower_index_wins_a_tie(small) -> None:
+    world, plant = world_of(small, ["bench"])
+    for scores, winner in (([np.nan, 3.0, 3.0], 1), ([0.5, 0.2, 0.2], 1), ([np.nan] * 3, 0), ([6.9, np.nan, 7.0], 0)):
+        world = with_difficulty(world, np.array(scores)[None, :, None, None])
+        state = step(world, initial(world), np.ones((1, 3), int), plant).state
+        assert (state.mode[0] == WORKING).nonzero()[0].tolist() == [winner]
+        expected = [-1, -1, -1]
+        expected[winner] = 1
+        assert state.last_award[0].tolist() == expected
 
 
 def test_one_station_serves_one_job_at_a_time(small) -> None:
