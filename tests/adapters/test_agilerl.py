@@ -103,13 +103,6 @@ def test_a_reset_brings_the_infos_of_the_end_up_to_date(small_workshop) -> None:
     assert [repr(infos) for infos in kept[:2]] == before[:2]
 
 
-def test_another_kind_of_mask_is_refused(small_workshop) -> None:
-    from fleet.env.adapters.agilerl import AgileRLEnv
-
-    with pytest.raises(ValueError, match="masks must be one of 'list', 'array'"):
-        AgileRLEnv(small_workshop()(), masks="tuple")
-
-
 def test_the_example_of_the_page_runs(example) -> None:
     told = example("AgileRL")
     assert set(told["actions"]) == {"arm_0", "arm_1", "arm_2"}

@@ -89,9 +89,6 @@ def test_nothing_is_given_where_nothing_is_possible(rule):
     assert rule(np.zeros((2, 0)), 1).tolist() == [NONE, NONE]
 
 
-# cost
-
-
 def fleet(difficulty, **other) -> list[Observation]:
     """What the arms know that find the jobs so difficult, [arm][slot], NaN unknown; every arm may claim every job."""
     d = np.array(difficulty, dtype=float)

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.policy import WAIT, Policy, on_arrays
+from agents.policy import WAIT, Policy
 from agents.prices import BidPrice, Bids, best_pairs, bids_of, price_of
 from agents.registry import make_policy
 from fleet.env.allocation_v2 import parallel_env
 from fleet.observation import BIDS, LONG_S, LazyObservation, Observation
-from tests.agents.observations import NAMES, drawn, observation, of_arms
+from tests.agents.observations import observation
 from tests.profiles import examples
 
 SCARCE_S, COMMON_S = 400.0, 300.0
@@ -233,40 +233,3 @@ def test_with_all_messages_every_arm_claims_what_the_auctioneer_would_give_it(sm
         claims += sum(action > 0 for action in actions.values())
         env.step(actions)
     assert claims > 10
-
-
-def shift(rng: np.random.Generator, decisions: int = 6) -> list[dict[str, Observation]]:
-    """Random instants of a shift, 200 s apart."""
-    return [
-        {
-            name: LazyObservation(lambda field, seen=seen: getattr(seen, field), left_s=np.array(5000.0 - 200.0 * k))
-            for name, seen in of_arms(drawn(rng)).items()
-        }
-        for k in range(decisions)
-    ]
-
-
-def test_other_labels_of_arms_give_other_labels_of_claims() -> None:
-    rng = np.random.default_rng(4)
-    claims = 0
-    for _ in range(20):
-        policy, other, order = make_policy("bid_price"), make_policy("bid_price"), rng.permutation(5)
-        for seen in shift(rng):
-            names = list(seen)
-            expected = policy.act(seen)
-            moved = other.act({names[a]: seen[names[a]] for a in order})
-            assert moved == {names[a]: expected[names[a]] for a in order}
-            claims += sum(action > 0 for action in expected.values())
-    assert claims > 100
-
-
-def test_shifts_side_by_side_get_the_claims_of_each_alone() -> None:
-    shifts = [shift(np.random.default_rng(seed)) for seed in range(3)]
-    together = on_arrays({e: make_policy("bid_price") for e in range(3)}, tuple(shifts[0][0]))
-    assert together is not None
-    alone = [make_policy("bid_price") for _ in shifts]
-    for each in zip(*shifts, strict=True):
-        names = (name for name in NAMES if name != "peers")
-        stacked = {name: np.stack([[getattr(a, name) for a in seen.values()] for seen in each]) for name in names}
-        found = together(np.arange(3), LazyObservation(stacked.__getitem__))
-        assert found.tolist() == [list(policy.act(seen).values()) for policy, seen in zip(alone, each, strict=True)]

@@ -153,9 +153,6 @@ def test_fleets_side_by_side_get_the_actions_of_each_alone(name) -> None:
         assert decide(envs, Observation(**stacked)).tolist() == expected
 
 
-# round_robin
-
-
 def test_round_robin_rotates() -> None:
     one_job = fleet([[1.0]] * 3)
     assert act("round_robin", *[one_job] * 4) == [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0]]
@@ -169,17 +166,11 @@ def test_round_robin_passes_over_whom_it_cannot_ask() -> None:
     assert act("round_robin", busy, unable, fleet([[1.0]] * 3)) == [[0, 1, 0], [1, 0, 0], [0, 1, 0]]
 
 
-# coolest_first
-
-
 def test_coolest_first_gives_the_oldest_job_to_the_most_headroom() -> None:
     seen = fleet([[1.0, 1.0]] * 3, headroom_k=[10.0, 30.0, 20.0])
     assert act("coolest_first", seen) == [[0, 1, 2]]
     assert act("coolest_first", fleet([[1.0, 1.0]] * 3, headroom_k=[10.0, 30.0, 20.0], free=[1, 0, 1])) == [[2, 0, 1]]
     assert act("coolest_first", fleet([[1.0]] * 2, headroom_k=[-5.0, -9.0])) == [[1, 0]]
-
-
-# random
 
 
 def test_random_is_uniform_over_what_is_legal() -> None:
@@ -189,21 +180,6 @@ def test_random_is_uniform_over_what_is_legal() -> None:
     counts = np.bincount([policy.act(seen)["arm_0"] for _ in range(3000)], minlength=6)
     assert counts[[0, 2, 5]].tolist() == [0, 0, 0]
     assert stats.chisquare(counts[[1, 3, 4]]).pvalue > 0.01
-
-
-# least_difficulty
-
-
-def test_least_difficulty_takes_the_pair_with_most_advantage_first_ties_by_age_and_place() -> None:
-    # Arm 1 finds both easier, but slot 2 by more; against the average that is -1.25, its slot 1 -0.5.
-    assert act("least_difficulty", fleet([[2.0, 3.0], [1.0, 0.5]])) == [[1, 2]]
-    assert act("least_difficulty", fleet([[2.0], [1.9], [2.1]])) == [[0, 1, 0]]
-    assert act("least_difficulty", fleet([[1.0, 1.0, 1.0]] * 3)) == [[1, 2, 3]]
-
-
-def test_least_difficulty_does_not_starve_work_that_is_new_to_everybody() -> None:
-    # The older job is hard for both alike; a single free arm still takes it where the other is no better for it.
-    assert act("least_difficulty", fleet([[5.0, 1.0], [5.0, 0.5]], free=[1, 0])) == [[1, 0]]
 
 
 def test_least_difficulty_leaves_nothing_to_who_is_at_work_and_waits_for_no_station() -> None:
@@ -244,9 +220,6 @@ def test_by_advantage_agrees_with_one_who_sees_everything(name, data) -> None:
             given_away.add(slot)
     seen = fleet(d.tolist(), feasible=able.tolist(), free=free.tolist())
     assert act(name, seen) == [expected]
-
-
-# consensus
 
 
 def cut(seen: dict[str, Observation], links: list[tuple[int, int]]) -> dict[str, Observation]:

@@ -25,7 +25,7 @@ from fleet.bus.exchange.channel import PERFECT, Channel, Partition
 from fleet.bus.exchange.memory import UNHEARD, Broadcast, Delivery, Exchange, PeerView
 from fleet.bus.exchange.zenoh import ZenohExchange, messages_of
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.messages import DifficultyScores, Info, State, decode, encode, encoding
+from fleet.bus.protocol.messages import DifficultyScores, State, decode, encode
 from fleet.bus.router import Router, open_client
 from fleet.env.allocation_v2 import parallel_env
 from fleet.errors import BusError
@@ -114,10 +114,7 @@ def test_only_the_default_is_perfect():
         ({"loss": np.nan}, "loss must be 0 to 1"),
         ({"radius": -1.0}, "radius must be 0 to 2"),
         ({"radius": 0.3}, r"radius is for the topology random_geometric \(got 0.3 and complete\): give this topology"),
-        (
-            {"topology": "ring", "topology_seed": 3},
-            r"topology_seed is for the topology random_geometric \(got 3 and ring",
-        ),
+        ({"topology": "ring", "topology_seed": 3}, r"topology_seed is for the topology random_geometric \(got 3 and"),
         ({"topology_seed": -1}, "topology_seed must be 0 to 4294967295"),
     ],
 )
@@ -277,26 +274,8 @@ def test_a_new_episode_forgets_what_was_known_and_what_was_on_its_way():
     assert (carry(delivery, 20.0, said_s)[others] == 0.0).all()
 
 
-def test_chance_must_be_given():
-    with pytest.raises(ValueError, match="needs an rng"):
-        Delivery(THREE, Channel(jitter_s=1.0)).carry(0.0)
-    Delivery(THREE, Channel(delay_s=1.0)).carry(0.0)
-
-
 FOUR = ("a", "b", "c", "d")
 BIDS = ("duration_s", "peak_c", "p_saturation")
-
-
-def test_every_arm_receives_every_broadcast_at_once(make_words):
-    words = replace(make_words(np.random.default_rng(0), 4, 5.0), jobs=("w", "x", "y", "z"))
-    heard = Exchange(FOUR).share(words)
-    for receiver in range(4):
-        np.testing.assert_array_equal(heard.mode[receiver], words.mode)
-        np.testing.assert_array_equal(heard.headroom_k[receiver], words.headroom_k)
-        np.testing.assert_array_equal(heard.difficulty[receiver], words.difficulty)
-        for name in BIDS:
-            np.testing.assert_array_equal(getattr(heard, name)[receiver], getattr(words, name))
-    np.testing.assert_array_equal(heard.age_s, np.zeros((4, 4)))
 
 
 def test_scores_go_to_the_slot_of_their_job(make_words):
@@ -325,12 +304,6 @@ def test_on_a_ring_only_neighbours_are_heard(make_words):
     assert np.isnan(heard.difficulty[across]).all()
     assert (heard.age_s[~across] == 0.0).all()
     assert exchange.delivered == 3 * 8
-
-
-def test_with_a_loss_of_one_nothing_arrives(make_words):
-    exchange = Exchange(FOUR, Channel(loss=1.0), rng=np.random.default_rng(0))
-    age_s = exchange.share(make_words(np.random.default_rng(0), 4, 0.0)).age_s
-    np.testing.assert_array_equal(np.isinf(age_s), ~np.eye(4, dtype=bool))
 
 
 @examples(40, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -363,35 +336,6 @@ def test_a_delayed_word_is_the_word_of_then_under_the_names_of_now(make_words, t
                         np.testing.assert_array_equal(actual, np.broadcast_to(expected, np.shape(actual)))
 
 
-def test_lost_words_leave_the_last_known_and_its_age(make_words):
-    exchange = Exchange(FOUR, Channel(loss=0.5), rng=np.random.default_rng(3))
-    rng, age_s = np.random.default_rng(4), np.full((4, 4), np.inf)
-    np.fill_diagonal(age_s, 0.0)
-    grown = 0
-    for tick in range(30):
-        heard = exchange.share(make_words(rng, 4, 10.0 * tick))
-        older = heard.age_s == age_s + 10.0
-        assert (older | (heard.age_s == 0.0) | np.isinf(heard.age_s)).all()
-        grown += int(older[np.isfinite(age_s)].sum())
-        age_s = heard.age_s
-    assert grown > 0
-    assert exchange.late > 0
-    assert exchange.delivered + exchange.late == 30 * 12
-    # Binomial(360, 1/2): five standard deviations either side.
-    assert abs(exchange.late - 180) < 5 * np.sqrt(360 / 4)
-
-
-def test_the_same_seed_loses_the_same_words(make_words, assert_same):
-    def episode(seed: int) -> list[PeerView]:
-        rng = np.random.default_rng(0)
-        exchange = Exchange(FOUR, Channel(loss=0.3), rng=np.random.default_rng(seed))
-        return [exchange.share(make_words(rng, 4, 10.0 * tick)) for tick in range(10)]
-
-    for one, other in zip(episode(7), episode(7), strict=True):
-        assert_same(one, other)
-    assert any((a.age_s != b.age_s).any() for a, b in zip(episode(7), episode(8), strict=True))
-
-
 def test_relabelling_the_arms_relabels_what_is_heard(make_words, assert_same):
     order = [2, 0, 3, 1]
     rng = np.random.default_rng(5)
@@ -405,16 +349,6 @@ def test_relabelling_the_arms_relabels_what_is_heard(make_words, assert_same):
         )
         one, other = plain.share(words), turned.share(moved)
         assert_same(PeerView(**{f.name: getattr(one, f.name)[np.ix_(order, order)] for f in fields(PeerView)}), other)
-
-
-def test_a_new_episode_knows_nothing_of_the_last(make_words):
-    exchange = Exchange(FOUR, Channel(delay_s=10.0))
-    rng = np.random.default_rng(0)
-    heard = [exchange.share(make_words(rng, 4, 10.0 * tick)) for tick in range(3)][-1]
-    assert np.isfinite(heard.age_s).all()
-    exchange.begin()
-    heard = exchange.share(make_words(rng, 4, 0.0))
-    np.testing.assert_array_equal(np.isinf(heard.age_s), ~np.eye(4, dtype=bool))
 
 
 def test_a_delay_is_not_a_tick_longer_for_a_rounding(make_words):
@@ -569,8 +503,7 @@ def test_a_late_joiner_gets_the_last_word_and_who_said_it(make_words):
     """With nothing but Zenoh: the caches answer a subscriber that was not there."""
     samples: queue.Queue[zenoh.Sample] = queue.Queue()
     with ZenohExchange(ARMS, "f", timeout_s=PATIENCE_S) as bus:
-        words = make_words(np.random.default_rng(5), 3, 0.0)
-        bus.share(words)
+        bus.share(make_words(np.random.default_rng(5), 3, 0.0))
         with open_client(bus.endpoint or "", timeout_s=PATIENCE_S) as joiner:
             history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
             for topic in ("info", "difficulty"):
@@ -579,21 +512,9 @@ def test_a_late_joiner_gets_the_last_word_and_who_said_it(make_words):
                 )
             tokens = joiner.liveliness().get(keys.of_every_arm("f", "alive"), timeout=PATIENCE_S)
             present = {keys.parse(str(reply.ok.key_expr)).name for reply in tokens if reply.ok}
-            said = [samples.get(timeout=PATIENCE_S) for _ in range(6)]
+            heard = {str(samples.get(timeout=PATIENCE_S).key_expr) for _ in range(6)}
     assert present == set(ARMS)
-    for sample in said:
-        key = keys.parse(str(sample.key_expr))
-        index = ARMS.index(key.name)
-        kind = Info if key.topic == "info" else DifficultyScores
-        assert str(sample.encoding) == encoding(kind)
-        word = decode(kind, sample.payload.to_bytes())
-        assert word.arm == key.name
-        assert word.twin == words.twin[index]
-        if isinstance(word, Info):
-            assert word.joints == 7
-        else:
-            assert word.jobs == tuple(job for job in words.jobs if job)
-    assert len({str(sample.key_expr) for sample in said}) == 6
+    assert heard == {keys.of_arm("f", arm, topic) for arm in ARMS for topic in ("info", "difficulty")}
 
 
 def test_closing_leaves_no_thread_and_no_port(make_words):

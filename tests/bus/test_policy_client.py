@@ -16,7 +16,6 @@ import zenoh
 from jsonschema import Draft202012Validator
 
 from docs.bus_contract import EXAMPLES
-from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import MOST_BYTES, decode, encoding
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES, ActReply, ActRequest
 from fleet.bus.router import Router, open_client
@@ -222,29 +221,6 @@ def test_large_fleets_fit_and_larger_ones_are_told_to(router, served):
     assert MOST_BYTES < size < MOST_REQUEST_BYTES
     with refused("observations of 64 arms have .* bytes, and a request to a policy at most 4,194,304"):
         client(router, LIMIT_S).act(seen(64, 256))
-
-
-def test_what_goes_to_others_is_not_larger_than_before(router):
-    with (
-        open_client(router.endpoint, timeout_s=PATIENCE_S) as one,
-        open_client(router.endpoint, timeout_s=PATIENCE_S) as other,
-    ):
-        server = Server(one, "{}", key="thermofleet/v4/f/arm/arm_0/quote")
-        matches, querier = threading.Event(), other.declare_querier(keys.of_arm("f", "arm_0", "quote"))
-        listener = querier.declare_matching_listener(lambda status: matches.set() if status.matching else None)
-        assert querier.matching_status.matching or matches.wait(PATIENCE_S)
-        listener.undeclare()
-        for size in (MOST_BYTES + 1, MOST_BYTES):
-            for key in (keys.of_arm("f", "arm_0", "quote"), keys.of_every_arm("f", "quote")):
-                list(other.get(key, payload=b"x" * size, timeout=PATIENCE_S))
-        sizes = [len(server.requests.get(timeout=PATIENCE_S)[2]) for _ in range(2)]
-        assert sizes == [MOST_BYTES] * 2
-        assert server.requests.empty()
-
-
-def test_endpoints_beyond_loopback_are_refused_before_the_first_decision():
-    with pytest.raises(BusError, match="is not on loopback"):
-        PolicyClient("mine", fleet="f", endpoint="tcp/10.0.0.1:7447", limit_s=1.0)
 
 
 def test_with_certificates_the_auctioneer_alone_asks_and_the_policy_alone_replies(tmp_path):

@@ -10,8 +10,6 @@ from pathlib import Path
 import msgspec
 import pytest
 import zenoh
-from cryptography import x509
-from cryptography.x509.oid import ExtendedKeyUsageOID
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -341,13 +339,3 @@ def test_a_router_in_no_roster_has_no_rights(place, tmp_path):
             wait_until(lambda: near.linked() == 0)
         listener.undeclare()
         session.close()
-
-
-def test_only_routers_have_certificates_for_both_ends(place):
-    def purposes(name):
-        certificate = x509.load_pem_x509_certificate((place / f"{name}.pem").read_bytes())
-        return set(certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value)
-
-    both = {ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH}
-    assert purposes("router") == purposes(FAR.name) == both
-    assert all(purposes(name) == {ExtendedKeyUsageOID.CLIENT_AUTH} for name in (*ARMS, "auctioneer", "operator"))

@@ -50,9 +50,6 @@ def test_jobs_done_in_the_last_step_terminate_and_do_not_truncate(make, play) ->
     assert last(steps - 1) == (steps - 1, False, True)
 
 
-# Exchanges and watchers
-
-
 def test_zenoh_and_memory_give_the_same_episode(make, play) -> None:
     memory = make({"ticks": 12}, keep_events=True)
     over_zenoh = make(

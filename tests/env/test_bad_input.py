@@ -15,9 +15,6 @@ MAKERS = (make_env, lambda scenario, **options: make_batch(scenario, 2, **option
 NO_SEEDS = (-1, 1.5, "a", True, [1, 2], np.array([1, 2]), np.array(3.0))
 
 
-# The single environment
-
-
 def test_actions_may_be_numpy_integers(make, play) -> None:
     env, other = make(), make()
     env.reset(seed=1)
@@ -120,9 +117,6 @@ def test_the_aec_env_refuses_wrong_actions(small) -> None:
     assert first not in env.agents
 
 
-# The batch
-
-
 @pytest.mark.parametrize(
     "actions",
     [
@@ -213,9 +207,6 @@ def test_num_envs_and_max_cycles_must_be_positive(batch, count) -> None:
     if count is not None:
         with pytest.raises(ValueError, match=r"max_cycles must be an integer >= 1 \(got "):
             batch(2, max_cycles=count)
-
-
-# Scenarios
 
 
 def beyond(cell) -> dict[str, Any]:
@@ -333,19 +324,13 @@ def test_invalid_ambient_temperatures_are_refused(cell, plans, warmer_k) -> None
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            {"ambient_k": (2.0, 1.0)},
-            r"Randomisation\.ambient_k must be two finite numbers, low <= high \(got \(2\.0, 1\.0\)\)",
-        ),
+        ({"ambient_k": (2.0, 1.0)}, r"Randomisation\.ambient_k must be two finite numbers, low <= high \(got \(2\.0,"),
         ({"arrivals": (2.0, 1.0)}, r"Randomisation\.arrivals must be two finite numbers, low <= high"),
         ({"arrivals": (0.0, 1.0)}, r"Randomisation\.arrivals must be > 0"),
         ({"ambient_k": (0.0, float("inf"))}, r"Randomisation\.ambient_k must be two finite numbers"),
         ({"ambient_k": 3.0}, r"Randomisation\.ambient_k must be two finite numbers, .* \(got 3\.0\)"),
         ({"arrivals": (float("nan"), 1.0)}, r"Randomisation\.arrivals must be two finite numbers"),
-        (
-            {"arrivals": (1.0, 1e9)},
-            r"Randomisation\.arrivals must be > 0 and at most 100 \(got \(1\.0, 1000000000\.0\)\)",
-        ),
+        ({"arrivals": (1.0, 1e9)}, r"Randomisation\.arrivals must be > 0 and at most 100 \(got \(1\.0, 1000000000\.0"),
         ({"arrivals": None}, r"Randomisation\.arrivals must be two finite numbers, .* \(got None\)"),
         ({"ambient_k": ("a", "b")}, r"Randomisation\.ambient_k must be two finite numbers, .* \(got \('a', 'b'\)\)"),
         ({"variants": 3}, r"Randomisation\.variants must be a list of dictionaries, .+ \(got 3\)"),

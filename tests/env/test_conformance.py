@@ -60,9 +60,6 @@ def module(small) -> SimpleNamespace:
     )
 
 
-# PettingZoo's checks
-
-
 @pytest.mark.parametrize("arms", [1, 2, 4])
 def test_pettingzoo_parallel_test_passes(make, arms) -> None:
     parallel_api_test(make({"arms": arms}), num_cycles=200)
@@ -92,9 +89,6 @@ def test_pettingzoo_render_test_passes(module, monkeypatch) -> None:
 
 def test_pettingzoo_state_test_passes(module, quiet) -> None:
     state_test(module.env(), module.parallel_env(), num_cycles=50)
-
-
-# Every step of whole episodes
 
 
 @pytest.mark.parametrize("options", [{}, {"keep_events": True}, {"mask_in": "both"}, {"mask_in": "info"}])
@@ -128,28 +122,6 @@ def test_results_of_a_parallel_env_are_in_its_spaces(make, play, seed, options) 
         assert rewards["arm_1"] == pytest.approx(sum(infos["arm_1"][f"reward_{name}"] for name in TERMS), abs=1e-12)
         ended.append(terminated["arm_0"] + truncated["arm_0"])
     assert ended == [0] * (len(ended) - 1) + [1]
-
-
-def test_results_of_an_aec_env_are_in_its_spaces(module) -> None:
-    env = module.env()
-    for seed in range(3):
-        env.reset(seed=seed)
-        rng, keys, turns, ends = np.random.default_rng(seed), None, 0, set()
-        for arm in env.agent_iter():
-            observed, reward, terminated, truncated, info = env.last()
-            fits(env.observation_space(arm), observed)
-            assert np.isfinite(reward)
-            keys = keys or list(info)
-            assert list(info) == keys
-            if terminated or truncated:
-                ends.add((terminated, truncated))
-                env.step(None)
-                continue
-            assert arm == env.possible_agents[turns % env.max_num_agents]
-            turns += 1
-            env.step(int(rng.choice(np.flatnonzero(observed["action_mask"]))))
-        assert len(ends) == 1
-        assert turns % env.max_num_agents == 0
 
 
 def test_results_of_a_batch_are_in_its_spaces(batch, play) -> None:
@@ -198,9 +170,6 @@ def fits(space: Any, observed: Any) -> None:
     """Assert that an observation is in its space and finite."""
     assert space.contains(observed)
     assert np.isfinite(observed["observation"] if isinstance(space, Dict) else observed).all()
-
-
-# Objects
 
 
 def test_spaces_are_the_same_objects_at_every_call(make) -> None:

@@ -150,9 +150,6 @@ def test_an_episode_with_losses_and_delay_repeats_by_seed(small) -> None:
     assert env.messages == messages
 
 
-# Copies
-
-
 @pytest.mark.parametrize("options", [{}, {"keep_events": True}, {"mask_in": "info"}], ids=["default", "events", "info"])
 @pytest.mark.parametrize("way", COPIES)
 def test_a_copy_within_an_episode_continues_identically(make, play, way, options) -> None:
@@ -186,9 +183,6 @@ def test_a_copy_of_a_batch_continues_identically(batch, play, way) -> None:
     for one, two in zip(go_on(env, untouched), ahead, strict=True):
         play.same(one, two)
     play.same(env.reset()[0], other.reset()[0])
-
-
-# Order
 
 
 @pytest.mark.parametrize("keep_events", [False, True])
@@ -326,12 +320,6 @@ def test_every_entry_point_repeats_a_recorded_run(fleet, recorded, play) -> None
     measured = recorded.readings.temp_c[-1]
     np.testing.assert_allclose(measured, truth.temp_c[0, :, WINDING], atol=6 * logged.world.motors.sensor_noise_k.max())
     assert terms["reward_finished_value"] == pytest.approx(recorded.metrics.value, rel=1e-9)
-
-
-def test_bus_and_watcher_do_not_change_a_run(fleet, recorded) -> None:
-    over_zenoh = run(fleet, RunSpec(policy=recorded.card["policy"], seed=SEED, bus="zenoh"), record=False)
-    assert list(map(repr, over_zenoh.events)) == list(map(repr, recorded.events))  # as text, because NaN != NaN
-    assert over_zenoh.reward == recorded.reward
 
 
 @pytest.mark.slow

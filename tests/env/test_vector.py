@@ -70,9 +70,6 @@ def many(library, play) -> list[dict[str, Any]]:
     return played(BatchEnv(library, 64, seed=SEED), play, list(range(64)))
 
 
-# Independence of rows
-
-
 def test_shifts_of_these_tests_terminate_and_truncate_at_different_times(many) -> None:
     terminated = np.array([step["terminated"] for step in many[1:]])
     truncated = np.array([step["truncated"] for step in many[1:]])
@@ -128,8 +125,6 @@ def test_results_do_not_depend_on_the_number_of_threads(library, play, threads) 
     for a, b in zip(one, several, strict=True):
         play.same(a, b)
 
-
-# Messages that are late or lost
 
 LATE = Channel(delay_s=25.0, loss=0.3)
 
@@ -187,9 +182,6 @@ def test_one_seed_counts_up_and_a_list_gives_one_per_row(batch, play) -> None:
         play.same(again.reset(seed=seed)[0], up[0])
     alike = batch(3, SHIFT, seed=[4, 4, 4]).reset()[0]
     assert all((values == values[:1]).all() for values in alike.values())
-
-
-# Resets
 
 
 def test_autoreset_returns_the_first_observation_of_a_reset(batch, play) -> None:
@@ -445,31 +437,6 @@ def test_a_warmer_cell_warms_every_motor(cell, plans) -> None:
     warmer = warm.state.temp_c - cool.state.temp_c
     assert warmer.min() > 3.0 - 1e-5
     assert 3.0 + 1e-6 < warmer.max() < 3.1  # a warmer motor has slightly higher losses
-
-
-def test_rows_of_two_variants_equal_batches_of_each(cell, plans, play) -> None:
-    """Compare the rows of a batch of two variants with a batch of each."""
-    options: dict[str, Any] = {"difficulty": "oracle", "cache": plans}
-    variant = {"spread": {"scale": 2.0, "seed": 9}}
-    both = make_batch(cell, 12, LAST_SEED, randomise=Randomisation(variants=[variant]), **options)
-    alone = [make_batch(cell, 12, LAST_SEED, **options, **each) for each in ({}, variant)]
-    obs, given = both.reset()[0], [env.reset()[0] for env in alone]
-    fleet = (obs["own"] == given[1]["own"]).all(axis=(1, 2)).astype(int)
-    for step in range(70):
-        is_one = [
-            (obs["own"] == each["own"]).all(axis=(1, 2)) & (obs["shared"] == each["shared"]).all(axis=1)
-            for each in given
-        ]
-        assert np.choose(fleet, is_one).all()
-        assert not (is_one[0] & is_one[1]).any()
-        for each, env in enumerate(alone):
-            np.testing.assert_array_equal(env.state.temp_c[fleet == each], both.state.temp_c[fleet == each])
-        actions = actions_of(play, obs["action_mask"], step)
-        (obs, _, terminated, truncated, _), given = both.step(actions), [env.step(actions)[0] for env in alone]
-        if (terminated | truncated).any():  # the next shift of a row may be of the other variant
-            break
-    assert step > 10
-    assert 0 < fleet.sum() < 12
 
 
 def test_the_single_env_and_its_simulator_are_those_of_the_variant_of_a_seed(cell, plans) -> None:

@@ -18,7 +18,6 @@ from benchmarks.paper.cooling import (
     fit_motor,
     fleet_rows,
     joint_row,
-    motor_rows,
 )
 from scenarios.evaluate.rollout import outcomes
 from scenarios.prepare.fleet import prepare
@@ -89,12 +88,6 @@ def test_the_fit_gives_the_stored_motor_and_says_what_the_figures_leave_open():
     np.testing.assert_allclose(astuple(fit.motor), astuple(ZHU_MOTOR), rtol=1e-3)
     assert max(fit.relative_sd, key=lambda name: fit.relative_sd[name]) == "bare_per_s"
     assert fit.relative_sd["bare_per_s"] > 1.0 > 0.3 > fit.relative_sd["water_per_s"]
-
-
-def test_every_published_figure_is_met_within_ten_percent():
-    rows = motor_rows()
-    assert [row["published"] for row in rows] == [3.6, 10.69, 11.59, 85.0, 3.7]
-    assert max(abs(row["modelled"] / row["published"] - 1) for row in rows) < 0.1
 
 
 def test_a_joint_settles_lower_with_every_active_cooling_and_later_with_every_passive_one():

@@ -14,11 +14,9 @@ from benchmarks.paper.subjects import Sizes, subjects_of
 from benchmarks.paper.sweep import (
     CONFIGURATIONS,
     OURS,
-    PARSIMONY,
     SWEEP,
     Configuration,
     key_of,
-    parsimony_rows,
     sweep_rows,
     sweep_tables,
     train_regressor,
@@ -187,16 +185,6 @@ def test_only_the_asked_rows_are_trained(subjects, monkeypatch):
 train = sweep.train
 
 
-@pytest.mark.ci_slow
-def test_d_of_the_carrying_joint_is_measured(subjects):
-    """Joint 2 of a standing arm carries."""
-    (row,) = rows_of(subjects[0], {OURS: TWO[OURS]})
-    assert row["carrier"] == 2
-    assert [list(row[label]) for label in sweep.HOT] == [["auroc", "auprc", "spearman"]] * 3
-    table = sweep_tables([row])["sweep"]
-    assert len(table.head) == len(table.rows[0]) == 12
-
-
 def made_up(configuration: str, subject: str, auroc: float) -> dict:
     quality = dict.fromkeys(("auroc", "auprc", "spearman"), auroc)
     scores = dict.fromkeys(sweep.HOT, quality)
@@ -270,21 +258,6 @@ def test_the_regressor_learns_heat_from_torque(make_heat_jobs):
     assert np.sqrt((error[:, 1] ** 2).mean()) < 0.6 * rise_k[160:, 1].std()
     with pytest.raises(ValueError, match="40 plans, 3 rows"):
         train_regressor(plans[:40], [1] * 40, rise_k[:3], TwinConfig(), 0, steps=1)
-
-
-@pytest.mark.ci_slow
-def test_rows_of_each_model_and_amount(monkeypatch, subjects):
-    monkeypatch.setattr(sweep, "JOBS", (3, 6))
-    monkeypatch.setattr(sweep, "STEPS", 3)
-    subject = subjects[0]
-    keys = [sweep.parsimony_key(model, jobs, subject) for jobs in (3, 6) for model in sweep.MODELS]
-    found = dict(parsimony_rows(subject, keys))
-    assert list(found) == keys
-    rows = list(found.values())
-    assert [(row["model"], row["jobs"]) for row in rows] == [(m, n) for n in (3, 6) for m in sweep.MODELS]
-    assert all(0.0 <= row["auroc"] <= 1.0 for row in rows)
-    assert rows[0]["minutes"] < rows[3]["minutes"]
-    assert len(PARSIMONY.tables(rows)["parsimony"].rows) == 6
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from benchmarks.paper.subjects import CARRIER, Study, detection, make_study
 from fleet.arm.model import ArmModel
 from fleet.difficulty import SETTLING_S
 from fleet.errors import FleetError
-from fleet.heat.thermal import HOUSING, NODES, WINDING, ThermalSpread, drive_heat
+from fleet.heat.thermal import HOUSING, NODES, WINDING, drive_heat
 from fleet.motion import drive
 from fleet.robot import JOINTS, ThermalLimits
 from scenarios.prepare.calibrate import AIR_SD_K, own_logs, past_jobs
@@ -104,15 +104,6 @@ def test_exploration_takes_the_place_of_work_and_leaves_the_rest_as_it_is(study)
 def test_held_out_jobs_do_not_depend_on_how_many_are_learned_from(study):
     alone = make_study(SEED, train=0, reference=SIZES["reference"], test=0, novel=0)
     assert profiles(alone.reference.plans) == profiles(study.reference.plans)
-
-
-def test_no_spread_is_the_nominal_arm():
-    from fleet.heat.motor import gen3_motors
-
-    nominal = make_study(SEED, train=0, reference=0, test=1, novel=0, spread=ThermalSpread())
-    assert np.array_equal(nominal.motors.idle_w, gen3_motors().idle_w)
-    assert nominal.train.peak_c.shape == (0, JOINTS)
-    assert nominal.train.records() == []
 
 
 def test_records_are_phases_and_show_a_long_hold_in_part(study):

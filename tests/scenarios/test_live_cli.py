@@ -39,19 +39,16 @@ from fleet.errors import BusError, FleetError, LogError
 from fleet.job import Job, Place, Work
 from fleet.live.job_client import batches
 from scenarios.live import auctioneer as live_auction
-from scenarios.live.arm import ambient_of, replayed_arm, simulated_arm, wait_for_name
+from scenarios.live.arm import ambient_of, replayed_arm, wait_for_name
 from scenarios.live.auctioneer import job_spec, refuse_other_way, scenario_jobs
 from scenarios.live.requests import read_jobs
 from scenarios.prepare.fleet import make_env, prepare, prepare_arm
-from scenarios.progress import quiet
 from scenarios.spec.load import load
 from scenarios.spec.schema import Ambient
 from tests import commands
 from tests.waiting import PATIENCE_S, serve_until, serving
-from twin.logs.reader import read
 from twin.logs.recording import READINGS
 
-LOGS = Path(__file__).parents[2] / "../shared/data/gen3_logs"
 TIME_S = np.arange(0.0, 4.0, 0.1)
 
 
@@ -113,12 +110,9 @@ ARM = {
     "left --rate-hz 1000": "--rate-hz must be > 0 and at most 100 (got 1000).",
     "left --capacity 0": "--capacity must be 1 to 256 (got 0).",
     "left --seed -1": "--seed must be 0 to 4294967295 (got -1).",
-    "left --speed inf": "--speed must be 0.001 to 10000 (got inf).",
     "left none.csv --source log": "none.csv",
     "left --difficulty blind --endpoint udp/127.0.0.1:1": "is no endpoint of this bus",
     "left --policy wspt": "'wspt' needs an auctioneer: start it with thermofleet bus auctioneer",
-    "left --policy ssi": "'ssi' needs an auctioneer: start it with thermofleet bus auctioneer",
-    "arm_9 --policy random": "No arm 'arm_9' in heat",
     "left --policy random --jobs all": "No source of jobs 'all'. Allowed: none, scenario.",
 }
 POLICIES = {
@@ -235,24 +229,6 @@ def test_a_log_without_temperatures_is_refused(log, tmp_path):
     bare.write_text("\n".join(",".join(line.split(",")[:22]) for line in lines))
     with pytest.raises(LogError, match="no motor temperatures"):
         replayed_arm("arm", bare)
-
-
-def test_an_arm_that_the_scenario_lacks_is_refused(small_toml, plans):
-    with pytest.raises(FleetError, match="No arm 'museum'"):
-        simulated_arm(load(small_toml), "museum", "blind", 0, quiet, plans)
-
-
-@pytest.mark.skipif(not LOGS.is_dir(), reason="the real logs are not here")
-def test_a_real_arm_is_replayed_as_it_was_logged():
-    file = sorted(LOGS.glob("*.csv.gz"))[0]
-    (recording,) = read(file, damaged="skip")
-    body = replayed_arm("kinova", file).body(1000.0, 0.1)
-    for row in np.linspace(0, len(recording.time_s) - 2, 50).astype(int).tolist():
-        body.advance(1000.0 + recording.time_s[row] - recording.time_s[0] + 1e-6)
-        reading = body.read_sensors()
-        np.testing.assert_array_equal(reading.temp_c, recording.temp_c[row])
-        np.testing.assert_array_equal(reading.q, recording.q[row])
-        np.testing.assert_array_equal(reading.current_a, recording.current_a[row])
 
 
 @pytest.mark.parametrize("points", [((0.0, 28.0),), ((0.0, 28.0), (600.0, 28.0)), ((0.0, 20.0), (600.0, 40.0))])
@@ -510,10 +486,7 @@ def test_jobs_are_read_from_lines_or_a_list(tmp_path):
     [
         (f"{json.dumps(HOLD)}\n{{}}", "line 2: Object missing required field `name`."),
         (json.dumps(HOLD | {"repetitions": 0}), "line 1: JobSpec.repetitions must be between 1 and 100000 (got 0)."),
-        (
-            json.dumps([HOLD, HOLD | {"kind": "dance"}]),
-            "No kind of job 'dance'. Allowed: hold, pick_place, press, sort (at [1].kind).",
-        ),
+        (json.dumps([HOLD, HOLD | {"kind": "dance"}]), "No kind of job 'dance'. Allowed: hold, pick_place, press,"),
         (json.dumps(HOLD | {"places": ["a", "b"]}), "line 1: JobSpec.places must be one place for a hold (got a, b)."),
         ("{", "line 1: Input data was truncated."),
         ("\n", "contains no jobs."),

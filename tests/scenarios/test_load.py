@@ -36,14 +36,14 @@ from scenarios.spec.load import library, load, own_seed
 from scenarios.spec.options import RunSpec
 from scenarios.spec.parse import override, parse_scenario
 from scenarios.spec.schema import Ambient, Scenario
+from tests.scenarios.conftest import SMALL
 
 FILE = Path("heat.toml")
 
 
 def small() -> dict[str, Any]:
     """The parsed small scenario, fresh each time."""
-    text = (Path(__file__).parent / "conftest.py").read_text(encoding="utf-8")
-    return {"name": "heat", **tomllib.loads(text.split('SMALL = """')[1].split('"""')[0])}
+    return {"name": "heat", **tomllib.loads(SMALL)}
 
 
 def put(*path_and_value: Any) -> Callable[[dict[str, Any]], None]:
@@ -69,6 +69,11 @@ def drop(*path: Any) -> Callable[[dict[str, Any]], None]:
     return edit
 
 
+def oven(**changes: Any) -> list[dict[str, Any]]:
+    """A list of one fixture."""
+    return [{"name": "oven", "position_m": [0, 0, 1], "size_m": [1, 1, 1], **changes}]
+
+
 def told(edit: Callable[[dict[str, Any]], None]) -> str:
     raw = small()
     edit(raw)
@@ -80,7 +85,6 @@ def told(edit: Callable[[dict[str, Any]], None]) -> str:
 WRONG = [
     (put("ambint", 3), "unknown key 'ambint'; did you mean 'ambient'? Allowed: ambient, arms,"),
     (put("arms", 0, "tool", 1), "arms[0]: unknown key 'tool'; did you mean 'tool_kg'? Allowed: "),
-    (put("twin", "siz", "quick"), "twin: unknown key 'siz'; did you mean 'size'? Allowed: air_c,"),
     (put("arms", 0, "tool_kg", "heavy"), "arms[0].tool_kg: expected a number, got a text ('heavy')."),
     (put("arms", 1, "tool_kg", -1), "arms[1].tool_kg must be >= 0 and finite (got -1.0)."),
     (put("arms", 0, "position_m", [0, 0]), "arms[0].position_m: expected 3 values, got 2."),
@@ -88,14 +92,9 @@ WRONG = [
     (put("arms", 0, "cooling", "stil_air"), "arms[0].cooling: 'stil_air' is not allowed; did you mean 'still_air'?"),
     (put("arms", 0, "home", "hom"), "arms[0].home 'hom' is no posture; did you mean 'home'? Allowed: home,"),
     (put("arms", 0, "name", "a b"), "arms[0].name must be non-empty, without any of / * $ ? # @ or space"),
-    (put("arms", 0, "name", 3), "arms[0].name: expected a text, got a whole number (3)."),
     (drop("arms", 0, "name"), "arms[0]: 'name' is missing."),
     (put("arms", 1, "name", "left"), "arms[1].name: 'left' is given twice, as in arms[0].name; names must be unique."),
-    (
-        put("arms", 1, "position_m", [-0.45, 0.0, 0.05]),
-        "arms[1].position_m: 'right' is 0.05 m from 'left' (arms[0]); bases must be at least 0.2 m apart.",
-    ),
-    (put("arms", []), "arms: there are no arms; give at least one [[arms]]."),
+    (put("arms", 1, "position_m", [-0.45, 0.0, 0.05]), "(arms[0]); bases must be at least 0.2 m apart."),
     (drop("arms"), "arms: there are no arms; give at least one [[arms]]."),
     (put("arms", {"name": "x"}), "arms: expected a list, got a table."),
     (drop("jobs"), "jobs: there are no jobs; give at least one [[jobs]]."),
@@ -109,27 +108,10 @@ WRONG = [
     (put("decision_interval_s", 1e6), "decision_interval_s must not exceed horizon_s (got 1000000.0, "),
     (put("slots", 2.5), "slots: expected a whole number, got a number (2.5)."),
     (put("slots", 0), "slots must be between 1 and 256 (got 0)."),
-    (
-        put("name", "../up"),
-        "name must have 1 to 128 printable characters without / \\ [ ], and no dot or space at the start "
-        "(got '../up').",
-    ),
-    (
-        put("places", 0, "position_m", [0.0, math.nan, 0.0]),
-        "places[0].position_m[1]: expected a finite number, got nan",
-    ),
-    (
-        put("places", 1, "name", "bench"),
-        "places[1].name: 'bench' is given twice, as in places[0].name; names must be unique.",
-    ),
+    (put("name", "../up"), "name must have 1 to 128 printable characters without / \\ [ ], and no dot or space at the"),
     (put("jobs", 0, "payload_kg", [-1.0]), "jobs[0].payload_kg must be between 0 and 10 kg (got -1.0)."),
-    (put("jobs", 0, "payload_kg", 1.0), "jobs[0].payload_kg: expected a list, got a number (1.0)."),
-    (put("jobs", 0, "value", math.inf), "jobs[0].value: expected a finite number, got inf."),
     (put("jobs", 0, "kind", "hol"), "jobs[0].kind: 'hol' is not allowed; did you mean 'hold'? Allowed: hold, pick_"),
-    (
-        put("jobs", 0, "places", ["bnch"]),
-        "jobs[0].places: no place 'bnch'; did you mean 'bench'? Allowed: bench, shelf.",
-    ),
+    (put("jobs", 0, "places", ["bnch"]), "jobs[0].places: no place 'bnch'; did you mean 'bench'? Allowed: bench,"),
     (put("jobs", 1, "places", ["bench"]), "jobs[1].places must be two different places, from and to, for a sort (g"),
     (put("jobs", 0, "places", ["bench", ["shelf"]]), "jobs[0].places must be names, or lists of names (got ['bench', "),
     (put("jobs", 0, "places", [["bench"], ["bench"]]), "jobs[0].places must name each alternative once (got [('bench"),
@@ -145,19 +127,12 @@ WRONG = [
     (put("jobs", 0, "after", ["hold"]), "jobs[0].after: there is no stream 'hold' above this one."),
     (put("jobs", 1, "after", ["hol"]), "jobs[1].after: there is no stream 'hol' above this one; did you mean 'hold'?"),
     (drop("jobs", 0, "arrivals"), "jobs[0]: 'arrivals' is missing."),
-    (put("jobs", 0, "arrivals", []), "jobs[0].arrivals: expected a table, got a list."),
     (put("jobs", 0, "arrivals", {"kind": "poisson"}), "jobs[0].arrivals: arrivals of kind 'poisson' need 'every_s'."),
     (put("jobs", 0, "arrivals", "count", 0), "jobs[0].arrivals.count must be >= 1 (got 0)."),
-    (
-        put("jobs", 1, "arrivals", "every_s", 1e-6),
-        "jobs: about 1.8e+08 jobs would arrive in a shift; at most 100000 are",
-    ),
+    (put("jobs", 1, "arrivals", "every_s", 1e-6), "jobs: about 1.8e+08 jobs would arrive in a shift; at most 100000"),
     (put("jobs", 1, "arrivals", "count", 3), "arrivals of kind 'poisson' take no 'count'; they take every_s, start_s,"),
     (put("jobs", 0, "arrivals", {"kind": "trace"}), "arrivals of kind 'trace' need either 'times_s' or 'file'."),
-    (
-        put("limits", "warning_c", 90),
-        "limits need lower_c < restart_c < warning_c < error_c (got 0.0, 50.0, 90.0, 75.0).",
-    ),
+    (put("limits", "warning_c", 90), "limits need lower_c < restart_c < warning_c < error_c (got 0.0, 50.0, 90.0, 75."),
     (put("limits", "error_c", 1e308), "limits.error_c must be between -60 and 1000 (got 1e+308)."),
     (put("people", {"contact_s": 0.5}), "people.contact_s must be between 1 and 28800 (got 0.5)."),
     (put("limits", "clear_s", 1e308), "limits.clear_s must be between 0 and 604800 (got 1e+308)."),
@@ -165,78 +140,51 @@ WRONG = [
     (put("arms", 0, "tilt_deg", [0, 0, 1e9]), "arms[0].tilt_deg must be between -360 and 360 (got [0.0, 0.0, 1"),
     (put("arms", 0, "wear", 1e9), "arms[0].wear must be between 0 and 10 (got 1000000000.0)."),
     (put("arms", 0, "cooling_factor", 0), "arms[0].cooling_factor must be between 0.01 and 100 (got 0.0)."),
-    (
-        put("arms", 0, "ambient_offset_k", 1e9),
-        "arms[0].ambient_offset_k must be between -50 and 50 (got 1000000000.0).",
-    ),
+    (put("arms", 0, "ambient_offset_k", 1e9), "arms[0].ambient_offset_k must be between -50 and 50 (got 1000000000.0)"),
     (put("reward", "energy", -1e308), "reward.energy must be between -1000000000 and 1000000000 (got -1e+308)."),
     (put("ambient", "points", [[0]]), "ambient.points[0]: expected 2 values, got 1."),
     (put("ambient", "points", [[0, 400]]), "ambient.points must be between -40 and 60 °C (got [400.0])."),
-    (put("reward", "faullts", 1), "reward: unknown key 'faullts'; did you mean 'faults'?"),
     (put("planning", "speeds", []), "planning.speeds must have at least one share of the speed limits (got [])."),
-    (put("twin", "size", "ful"), "twin.size: 'ful' is not allowed; did you mean 'full'? Allowed: full, quick."),
-    (
-        put("fixtures", [{"name": "oven", "position_m": [0, 0, 0], "size_m": [1, 0, 1]}]),
-        "fixtures[0].size_m must be three lengths between 0.001 and 10 m (got [1.0, 0.0, 1.0]).",
-    ),
-    (
-        put("fixtures", [{"name": "oven", "position_m": [0, 0, 1e9], "size_m": [1, 1, 1]}]),
-        "fixtures[0].position_m must be coordinates between -10 and 10 m (got 0.0, 0.0, 1000000000.0); were "
-        "millimetres meant?",
-    ),
-    (
-        put("fixtures", [{"name": "oven", "position_m": [0, 0, 1], "size_m": [1, 1, 1], "tilt_deg": [0, 400, 0]}]),
-        "fixtures[0].tilt_deg must be between -360 and 360 (got [0.0, 400.0, 0.0]).",
-    ),
-    (
-        put("fixtures", [{"name": "oven", "position_m": [0, 0, i / 10], "size_m": [1, 1, 1]} for i in (1, 3)]),
-        "fixtures[1].name: 'oven' is given twice, as in fixtures[0].name; names must be unique.",
-    ),
-    (put("fixtures", [{"name": "", "position_m": [0, 0, 1], "size_m": [1, 1, 1]}]), "fixtures[0].name must not be"),
-    (put("fixtures", [{"name": "x", "size": 1}]), "fixtures[0]: unknown key 'size'; did you mean 'size_m'?"),
+    (put("fixtures", oven(size_m=[1, 0, 1])), "fixtures[0].size_m must be three lengths between 0.001 and 10 m (got"),
+    (put("fixtures", oven(position_m=[0, 0, 1e9])), "fixtures[0].position_m must be coordinates between -10 and 10 m"),
+    (put("fixtures", oven(tilt_deg=[0, 400, 0])), "fixtures[0].tilt_deg must be between -360 and 360 (got [0.0, 400.0"),
+    (put("fixtures", oven(name="")), "fixtures[0].name must not be"),
     (
         put("fixtures", [{"name": f"f{i}", "position_m": [0, 0, i / 10], "size_m": [1, 1, 1]} for i in range(65)]),
         "fixtures must be at most 64 (got 65).",
     ),
-    (put("spread", "seed", 1.5), "spread.seed: expected a whole number, got a number (1.5)."),
 ]
 
 
 KELVIN = {"warning_c": 333, "error_c": 348, "restart_c": 323}
-OVEN = {"name": "oven", "position_m": [0, 0, 1], "size_m": [800, 600, 20]}
 WRONG += [
     (put("limits", KELVIN), "limits.warning_c = 333: is this kelvin? 333 K is 59.9 °C. Give °C."),
     (put("ambient", "points", [[0, 298.15]]), "ambient.points = 298.15: is this kelvin? 298.15 K is 25.0 °C."),
     (put("twin", "cool_c", 313), "twin.cool_c = 313: is this kelvin? 313 K is 39.9 °C."),
     (put("twin", "air_c", [293, 303]), "twin.air_c = [293, 303]: is this kelvin? 303 K is 29.9 °C."),
-    (
-        put("arms", 0, "tilt_deg", [1.5708, 0, 0]),
-        "arms[0].tilt_deg = [1.5708, 0, 0]: is this radians? 1.5708 rad is 90°.",
-    ),
+    (put("arms", 0, "tilt_deg", [1.5708, 0, 0]), "[1.5708, 0, 0]: is this radians? 1.5708 rad is 90°."),
     (put("arms", 1, "tilt_deg", [0, 0, -3.14]), "arms[1].tilt_deg = [0, 0, -3.14]: is this radians? 3.14 rad is 180°."),
     (put("places", 0, "tool_deg", [math.pi, 0, 0]), "places[0].tool_deg = [3.14159, 0, 0]: is this radians?"),
     (put("jobs", 0, "payload_kg", [500, 1500]), "jobs[0].payload_kg = [500, 1500]: is this grams? 1500 g is 1.5 kg."),
     (put("arms", 0, "tool_kg", 900), "arms[0].tool_kg = 900: is this grams? 900 g is 0.9 kg. Give kg."),
     (put("arms", 0, "payload_limit_kg", 4000), "arms[0].payload_limit_kg = 4000: is this grams? 4000 g is 4 kg."),
-    (put("fixtures", [OVEN]), "fixtures[0].size_m = [800, 600, 20]: is this millimetres? 800 mm is 0.8 m."),
+    (
+        put("fixtures", oven(size_m=[800, 600, 20])),
+        "fixtures[0].size_m = [800, 600, 20]: is this millimetres? 800 mm is 0.8 m.",
+    ),
     (put("places", 0, "position_m", [400, 50, 200]), "(got 400.0, 50.0, 200.0); were millimetres meant?"),
     (put("places", 0, "retreat_m", 80), "places[0].retreat_m = 80: is this millimetres? 80 mm is 0.08 m."),
     (put("clearance_m", 20), "clearance_m = 20: is this millimetres? 20 mm is 0.02 m."),
     (put("horizon_s", 8), "(got 10.0, 8.0); is horizon_s in hours? 8 h is 28800 s."),
-    (put("horizon_s", "2h"), "horizon_s: expected a number, got a text ('2h')."),
     (put("job", []), "unknown key 'job'; did you mean 'jobs'? Allowed: ambient, arms,"),
     (put("jobs", [{"tabel": "monday.csv"}]), "jobs[0]: unknown key 'tabel'; did you mean 'table'? Allowed: after,"),
-    (put("jobs", 0, "due_s", "0:30"), "jobs[0].due_s: expected a number, got a text ('0:30')."),
     (put("jobs", 1, "arrivals", "kind", "poison"), "'poison' is not allowed; did you mean 'poisson'? Allowed: batch,"),
     (put("jobs", 1, "dwell_s", 500), "jobs[1].dwell_s of a sort must be at most 180 s, the time to open or close the "),
     (put("jobs", 0, "numbered", False), "jobs[0].numbered = false is for streams of one job: arrivals with one time"),
     (put("planning", "speeds", [60]), "planning.speeds must be between 0.05 and 1 (got [60.0])."),
     (put("bus", {"loss": 5}), "bus.loss must be 0 to 1 (got 5)."),
     (put("surprises", [{"kind": "fan", "arm": "left"}]), "'left' has no fan; its cooling must be forced_air."),
-    (
-        put("shift_begin", "6:00"),
-        "shift_begin must be a date with time and zone, as 2026-11-23T06:00+01:00 (got 6:00).",
-    ),
+    (put("shift_begin", "6:00"), "shift_begin must be a date with time and zone, as 2026-11-23T06:00+01:00 (got 6:00)"),
 ]
 
 
@@ -249,13 +197,6 @@ def test_a_wrong_entry_is_told_by_file_place_value_and_what_is_allowed(edit, sen
     assert not message.endswith("?.")
     assert "`" not in message
     assert "\n" not in message
-
-
-def test_the_small_scenario_itself_is_right():
-    scenario = parse_scenario(small(), FILE)
-    assert [arm.name for arm in scenario.arms] == ["left", "right"]
-    assert scenario.jobs[0].arrivals.count == 2
-    assert scenario.name == "heat"
 
 
 LEAVES = [
@@ -323,9 +264,7 @@ TRACES = [
     (b"", "'times.txt' holds no times; give one arrival time in seconds per line."),
     (b"0\n5 s\n", "heat.toml: jobs[0].arrivals.file: line 2 of 'times.txt' is not a number of seconds: '5 s'."),
     (b"0\n5\n3\n", "the times in 'times.txt' must be >= 0 and in order (3.0 s is not)."),
-    (b"-1\n", "must be >= 0 and in order (-1.0 s is not)."),
     (b"0\nnan\n5\n", "must be >= 0 and in order (nan s is not)."),
-    (b"0\ninf\n", "must be >= 0 and in order (inf s is not)."),
     (b"\xff\xfe\x00", "line 1 of 'times.txt' is not a number of seconds"),
 ]
 
@@ -351,8 +290,7 @@ def test_a_trace_file_lies_beside_its_scenario(tmp_path):
 def with_trace(folder: Path, content: bytes, horizon_s: float = 7200.0) -> Scenario:
     """The small scenario with a second stream that arrives as a file says."""
     (folder / "times.txt").write_bytes(content)
-    text = (Path(__file__).parent / "conftest.py").read_text(encoding="utf-8").split('SMALL = """')[1].split('"""')[0]
-    text = text.replace('kind = "poisson", every_s = 30', 'kind = "trace", file = "times.txt"')
+    text = SMALL.replace('kind = "poisson", every_s = 30', 'kind = "trace", file = "times.txt"')
     (folder / "cell.toml").write_text(text.replace("horizon_s = 180", f"horizon_s = {horizon_s}"), encoding="utf-8")
     return load(folder / "cell.toml")
 
@@ -367,10 +305,7 @@ OUTSIDE = [
     ([1_790_000_000_000], "its only time is outside the shift, which ends at horizon_s = 7200 (got 1790000000000 to"),
     ([1_790_000_000_000], "Are these milliseconds since 1970? The first is 2026-09-21 14:13:20 UTC."),
     ([90_000, 900_000], "Are these milliseconds? 900000 ms is 900 s. Give seconds."),
-    (
-        [7200, 7300],
-        "all 2 times are outside the shift, which ends at horizon_s = 7200 (got 7200 to 7300 s). Give seconds",
-    ),
+    ([7200, 7300], "all 2 times are outside the shift, which ends at horizon_s = 7200 (got 7200 to 7300 s). Give"),
 ]
 
 
@@ -431,8 +366,6 @@ def test_an_override_changes_that_field_and_no_other():
     [
         ({"horizn_s": 3}, "heat with overrides: unknown key 'horizn_s'; did you mean 'horizon_s'? Allowed: ambient,"),
         ({"horizon_s": -1}, "heat with overrides: horizon_s must be > 0 and finite (got -1.0)."),
-        ({"horizon_s": math.inf}, "heat with overrides: horizon_s: expected a finite number, got inf."),
-        ({"slots": "a"}, "heat with overrides: slots: expected a whole number, got a text ('a')."),
         ({"slots": object()}, "heat with overrides: expected numbers, texts, lists and tables, got <object object"),
         ({"arms": []}, "heat with overrides: arms: there are no arms; give at least one [[arms]]."),
     ],
@@ -510,16 +443,6 @@ def test_the_largest_set_is_the_one_that_trying_all_finds(name, cache):
         ):
             most = len(work)
     assert len(layout_report(scenario).at_once) == most
-
-
-def test_an_arm_alone_has_the_plans_it_has_in_the_fleet(cache):
-    scenario = load("quickstart")
-    fleet = prepare(scenario, difficulty="blind", cache=cache)
-    for whole in fleet.arms:
-        alone = prepare_arm(scenario, whole.robot.name, difficulty="blind", cache=cache)
-        assert list(alone.plans) == list(whole.plans)
-        for work, variants in whole.plans.items():
-            assert [(p.elbow, p.speed) for p in alone.plans[work]] == [(p.elbow, p.speed) for p in variants]
 
 
 def test_a_work_that_comes_too_close_to_a_home_is_infeasible_and_says_so(cache):

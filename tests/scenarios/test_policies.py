@@ -82,10 +82,7 @@ def test_an_own_class_from_a_file_or_a_module(own):
         ("{own}:Idel", "did you mean 'Idle'"),
         ("{own}:No", r"is no policy: of scope central it needs the methods reset\(rng\) and act\(observations\)"),
         ("{own}:Old", r"Old' has no valid scope \(got None\). Set in the class: scope = .central. if its act"),
-        (
-            "{own}:Needy",
-            r"must be a class or function that is called without arguments \(missing a required argument: 'size'\)",
-        ),
+        ("{own}:Needy", r"must be a class or function that is called without arguments \(missing a required argument:"),
         ("{own}:Unset", r"Unset has no central policy that an arm can have alone \(got None\)\. Add to the class"),
         ("nowhere.py:Idle", "there is no file 'nowhere.py'"),
         ("no_such_module:Idle", "cannot import 'no_such_module'"),

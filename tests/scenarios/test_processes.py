@@ -185,29 +185,6 @@ def test_a_killed_run_leaves_only_a_folder_with_a_dot(small_toml, tmp_path, plan
     assert all(p.name.startswith(".run.") for p in where.iterdir())
 
 
-@pytest.mark.ci_slow
-def test_the_processes_of_a_killed_comparison_end_with_it(small_toml, tmp_path, plans):
-    policy = tmp_path / "killer.py"
-    policy.write_text(
-        textwrap.dedent("""
-            import os, signal, threading
-
-            class Killer:
-                scope = "central"
-                def reset(self, rng): pass
-                def act(self, observations):
-                    os.kill(os.getppid(), signal.SIGKILL)
-                    threading.Event().wait(600)
-        """)
-    )
-    command = [sys.executable, "-m", "scenarios", "compare", str(small_toml), "--difficulty", "blind", "--workers", "2"]
-    command += ["--policies", f"{policy}:Killer,round_robin", "--seeds", "2", "--out", str(tmp_path / "out")]
-    env = {**os.environ, "THERMOFLEET_CACHE": str(plans)}
-    # Returns when no process has its output open.
-    killed = subprocess.run(command, env=env, capture_output=True, timeout=240, check=False)
-    assert killed.returncode == -signal.SIGKILL
-
-
 def interrupted(stage: str, **bar: str) -> str:
     """What is said of Ctrl-C in this stage."""
     try:

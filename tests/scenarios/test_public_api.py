@@ -63,10 +63,7 @@ class Mine:
     ("arguments", "says"),
     [
         ({"policies": "wsept"}, r"policies must be a list of names, .* \(got 'wsept'\)"),
-        (
-            {"policies": ["wsept", Mine]},
-            r"A policy is given by name: .*'mine.py:Mine' for a class in a file \(got <class",
-        ),
+        ({"policies": ["wsept", Mine]}, r"A policy is given by name: .*'mine.py:Mine' for a class in a file \(got"),
         ({"policies": ["wsept"], "seeds": [0, 1, 0]}, "Seed 0 is given twice"),
         ({"policies": ["wsept"], "seeds": 3}, r"seeds must be a list of integers, for example range\(3\) \(got 3\)"),
     ],

@@ -176,12 +176,6 @@ def test_an_arm_of_logs_needs_no_scenario(thermofleet, subject, tmp_path):
         assert not (tmp_path / "other").exists()
 
 
-@pytest.mark.slow
-def test_the_documented_command_recovers_an_arm_of_quickstart(thermofleet, tmp_path):
-    said = thermofleet("twin", "recover", "quickstart", "--payload", 3, "--posture", "raised", "--out", tmp_path / "r")
-    assert said.code == 0, said.err
-
-
 def test_a_light_hold_does_not_get_warm(subject):
     with pytest.raises(RecoveryError, match=r"does not get warm: holding 0.5 kg there for 30 min"):
         hold_until(subject.arm, np.zeros(7), 0.5, ambient_c=23.0, until_c=55.0, most_s=1800.0)
@@ -244,21 +238,6 @@ def test_hidden_housings_follow_from_how_fast_windings_warm(seconds, load_nm):
     # Over 30 s the mean of an exponential with 70 s lies 3.6 % of its rise above the mean of its ends.
     rise_k = np.abs(now[WINDING] - before[WINDING]).max()
     np.testing.assert_allclose(guess_c, middle_c, atol=0.04 * rise_k + 0.1)
-
-
-def test_without_the_rate_housings_would_come_out_too_cold():
-    """What the watching is for: the same formula with windings that do not warm."""
-    tau = np.array([1.0, -30.0, 1.0, 12.0, 0.5, 4.0, 0.0])
-    before = held(np.full(14, 23.0), tau, 300.0)
-    now = held(before, tau, 30.0)
-    blind_c, seen_c = (
-        housing_estimate(first, now[WINDING], 30.0, tau, MOTORS, THERMAL, 23.0)
-        for first in (now[WINDING], before[WINDING])
-    )
-    true_c = now[HOUSING][1]
-    assert blind_c[1] == pytest.approx(23.0)
-    assert seen_c[1] == pytest.approx(true_c, abs=0.5)
-    assert true_c > 24.5
 
 
 def test_the_hottest_motors_torque_error_ranks_postures_as_their_heat_does(subject):

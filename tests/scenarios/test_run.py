@@ -23,7 +23,7 @@ from scenarios.live.recorder import Recorder
 from scenarios.live.trace import NOT_RECORDED, rows_of, thread_of, thread_table
 from scenarios.prepare.fleet import Fleet, prepare
 from scenarios.result_folder import json_text
-from scenarios.run.log import FILES, OF_EVENTS, code_hash, record_table, telemetry_table, versions_of
+from scenarios.run.log import FILES, code_hash, telemetry_table, versions_of
 from scenarios.run.records import Offer, ShiftLog
 from scenarios.run.shift import RunLog, run
 from scenarios.show.run_page import verdict
@@ -215,14 +215,6 @@ def test_telemetry_rows_go_arm_by_arm_within_a_moment(result):
     for a, row in enumerate(rows):
         assert row["temp_c_2"] == pytest.approx(float(result.readings.temp_c[3, a, 1]), rel=1e-6)
         assert row["qd_7"] == pytest.approx(float(result.readings.qd[3, a, 6]), rel=1e-6)
-
-
-def test_events_keep_their_order_and_their_values(result):
-    rows = record_table(Event, result.events, **OF_EVENTS).to_pylist()
-    assert [row["time_s"] for row in rows] == sorted(event.time_s for event in result.events)
-    awards = [row for row in rows if row["kind"] == "award"]
-    assert {row["arm"] for row in awards} <= {"left", "right"}
-    assert awards[0]["job"]
 
 
 LOG = [

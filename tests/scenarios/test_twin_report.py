@@ -9,16 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet.arm.random_motions import random_jobs
 from fleet.errors import FleetError
 from fleet.motion import RATE_HZ
-from fleet.robot import Robot
-from scenarios.prepare.arms import hardware_of
-from scenarios.prepare.calibrate import own_logs
 from scenarios.result_folder import json_text
 from scenarios.show import twin_report as report
 from scenarios.show.page import Page
-from scenarios.spec.load import load
 from scenarios.table import Table
 from twin.logs.recording import Recording
 from twin.vae.config import TwinConfig
@@ -266,35 +261,6 @@ def test_the_documented_report_of_a_scenario_has_every_chapter(thermofleet, tmp_
     errors = card["chapters"]["reconstruction"]["numbers"]["mean_error_si"]
     assert errors["hot, twin"][TAU] > errors["cool, twin"][TAU]
     assert len(card["chapters"]["epochs"]["numbers"]["held out"][0]) == 6
-
-
-@pytest.fixture
-def simulated_logs(tmp_path) -> Path:
-    """Logs of an arm at simulated work, each half an hour, as files."""
-    hardware = hardware_of(load("quickstart"), 0)
-    rng = np.random.default_rng(0)
-    jobs = random_jobs(hardware.robot, 5, rng, payload_kg=(0.0, 0.5), name="light")
-    jobs += random_jobs(Robot(name=hardware.robot.name, tool_kg=2.0), 3, rng, payload_kg=(3.0, 4.0), name="heavy")
-    folder = tmp_path / "logs"
-    folder.mkdir()
-    for r in own_logs(hardware, jobs, rng, ambient_c=22.0):
-        assert r.temp_c is not None
-        columns = {"q": r.q, "qd": r.qd, "tau": r.tau, "temp_c": r.temp_c}
-        head = ["time_s", *(f"{name}_{j}" for name in columns for j in range(1, 8))]
-        rows = np.hstack([r.time_s[:, None], *columns.values()])
-        text = "\n".join([",".join(head), *(",".join(f"{v:.6f}" for v in row) for row in rows)])
-        (folder / f"{r.name.replace(' ', '_')}.csv").write_text(text + "\n", encoding="utf-8")
-    return folder
-
-
-@pytest.mark.slow
-def test_the_documented_report_of_simulated_logs_has_every_chapter(thermofleet, simulated_logs, tmp_path):
-    out = tmp_path / "report"
-    said = thermofleet("twin", "report", "--log", simulated_logs, "--seeds", 1, "--out", out)
-    assert said.code == 0, said.err
-    card = json.loads((out / "report.json").read_text(encoding="utf-8"))
-    assert card["failed"] == {}
-    assert set(card["chapters"]) == {"data", "latent", "reconstruction", "difficulty", "epochs", "generation"}
 
 
 LOGS = Path(__file__).parents[2] / "../shared/data/gen3_logs"

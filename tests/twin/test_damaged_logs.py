@@ -143,10 +143,7 @@ def stood(log: Log) -> str:
 SWAP = [0, 3, 2, 1, 4, 5, 6]
 TURN = 180 / np.pi
 WHOLE = {
-    "joint 4 beyond its stop": (
-        changed("Pos", lambda v: np.full_like(v, 170.0), 3),
-        "joint 4 at 170° is beyond its st",
-    ),
+    "joint 4 beyond its stop": (changed("Pos", lambda v: np.full_like(v, 170.0), 3), "joint 4 at 170° is beyond its"),
     "Fahrenheit": (changed("Temp", lambda v: v * 1.8 + 32), r"above 85 °C. Are these °F \(then 3"),
     "one joint in Fahrenheit": (changed("Temp", lambda v: v * 1.8 + 32, 5), r"temperature of joint 6 .* °F"),
     "kelvin": (changed("Temp", lambda v: v + 273.15), r"Are these kelvin \(then 3"),
@@ -174,24 +171,15 @@ WHOLE = {
     "days of a spreadsheet": (timed(lambda t: 46027 + t / 86400), "Is time in days"),
     "number of the sample": (timed(lambda t: np.arange(len(t)) * 1.0), "the angle changes 0.5"),
     "no clock": (timed(np.zeros_like), "time is always 0 s"),
-    "velocities in another order": (
-        reordered([6, 5, 4, 3, 2, 1, 0], "Velocity"),
-        "joint 1 follows the velocity of joint 7",
-    ),
+    "velocities in another order": (reordered([6, 5, 4, 3, 2, 1, 0], "Velocity"), "joint 1 follows the velocity of"),
     "an angle that stands for a minute": (rows_set("Pos", 1, 10, 270, 330.0), "angle of joint 2 never changes"),
     "columns between bars": (lambda: sound().text().replace(",", "|"), "Columns are separated by commas"),
     "a velocity not measured": (changed("Velocity", np.zeros_like, 3), "velocity of joint 4 never changes"),
     "an angle that stands": (changed("Pos", lambda v: np.full_like(v, 40.0), 4), "angle of joint 5 never changes"),
-    "a dead current sensor": (
-        changed("Current", lambda v: np.full_like(v, 0.4), 5),
-        "current of joint 6 is 0.4, for 14",
-    ),
+    "a dead current sensor": (changed("Current", lambda v: np.full_like(v, 0.4), 5), "current of joint 6 is 0.4, for"),
     "torque that dies midway": (changed("Torque", held, 2), "torque of joint 3 is .* sensor dead"),
     "sensor that dies midway": (changed("Temp", held, 1), "temperature of joint 2 is .* sensor dead"),
-    "all temperatures stand": (
-        lambda: stood(sound(rows=800)),
-        "temperature of joint 1 is 3.* sensor dead",
-    ),
+    "all temperatures stand": (lambda: stood(sound(rows=800)), "temperature of joint 1 is 3.* sensor dead"),
     "newest line first": (
         lambda: "\n".join([",".join(NAMES), *sound().text().splitlines()[:0:-1], ""]),
         "newest line the first. Sort",
@@ -213,10 +201,7 @@ WHOLE = {
     "rostopic": (header("%time", "field.header.seq", "field.position0"), "ROS messages, by its column '%time'"),
     "PlotJuggler": (header("__time", "/joint_states/joint_1/position"), "ROS messages"),
     "Kortex": (header("time", "actuators[0].position"), "Kortex API"),
-    "no unit of time": (
-        lambda: sound().text(["Time [s]", *NAMES[1:]]),
-        r"spelling: rename 'Time \[s\]' to 'Time \(s\)'",
-    ),
+    "no unit of time": (lambda: sound().text(["Time [s]", *NAMES[1:]]), r"spelling: rename 'Time \[s\]' to 'Time \(s"),
     "plain counted from 0": (
         lambda: sound().plain().text([n if n == "time_s" else f"{n[:-1]}{int(n[-1]) - 1}" for n in PLAIN_NAMES]),
         "counted from 0: rename 'q_0' to 'q_1'",

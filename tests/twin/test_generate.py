@@ -57,9 +57,6 @@ def source(make_plan, rng):
     return replace(plan, cycle=Phase(plan.cycle.profile.astype(np.float32), carried))
 
 
-# The shape of the path
-
-
 @given(st.integers(0, 2**31), st.floats(0.6, 9.0))
 def test_a_minimum_jerk_path_comes_out_as_it_is(seed, duration_s):
     begin, end = np.random.default_rng(seed).uniform(-2, 2, (2, 7))
@@ -101,9 +98,6 @@ def test_time_is_the_least_that_the_limits_allow(distance, joint, speed, duratio
         assert np.all(np.abs(motion[order]) <= speed * limit * (1 + 1e-6))
 
 
-# Motion from a twin that reconstructs exactly
-
-
 def test_what_a_twin_knows_exactly_comes_back_nearly_as_it_was(source):
     made = vary(exact_twin(), source, 0.0, np.random.default_rng(0))
     assert made.distance_rad < 0.02
@@ -128,9 +122,6 @@ def test_windows_share_noise_as_they_share_time(source, make_plan, motion):
     assert noise.std() == pytest.approx(2.0, rel=0.03)
     shared = 1 - (twin.config.window // OVERLAP) / twin.config.window
     assert np.mean(noise[1:] * noise[:-1]) / np.mean(noise**2) == pytest.approx(shared, abs=0.03)
-
-
-# Motion from a trained twin
 
 
 @settings(max_examples=6)

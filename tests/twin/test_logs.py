@@ -199,11 +199,7 @@ def test_as_many_samples_stay_as_can(times):
         (text([*GEN3, "Pos_0"], []).encode(), 1, "names the column 'Pos_0' twice"),
         (text(GEN3, map(gen3_row, TIME_S)).encode("utf-16-le"), 1, "holds NUL bytes; is it UTF-16"),
         (text(GEN3, map(gen3_row, TIME_S)).encode("latin-1").replace(b"T", b"\xb5"), 1, "begins with 'µime"),
-        (
-            text(PLAIN, [["0", *["89.5"] * 7, *["0"] * 28]]).encode(),
-            2,
-            "joint 2 at 89.5 rad is beyond its stops, .* Are these degrees",
-        ),
+        (text(PLAIN, [["0", *["89.5"] * 7, *["0"] * 28]]).encode(), 2, "joint 2 at 89.5 rad is beyond its stops, .*"),
     ],
 )
 def test_a_file_that_is_no_log_says_why(tmp_path: Path, content: bytes, line: int | None, match: str):
@@ -342,20 +338,6 @@ def test_signs_of_a_real_arm_are_those_of_the_model():
     np.testing.assert_allclose(
         np.polyfit(np.gradient(circle.q[:, 1], circle.time_s), circle.qd[:, 1], 1)[0], 1, atol=0.1
     )
-
-
-@needs_logs
-def test_a_real_log_cut_anywhere_keeps_its_whole_lines(tmp_path: Path):
-    packed = next(LOGS.glob("0_KinovaLog_120_20_weight_API.csv.gz")).read_bytes()
-    (whole,) = read(next(LOGS.glob("0_KinovaLog_120_20_weight_API.csv.gz")))
-    path = tmp_path / "cut.csv.gz"
-    for kept in np.random.default_rng(0).integers(2000, len(packed), 8):
-        path.write_bytes(packed[:kept])
-        with pytest.raises(LogError, match="cut off"):
-            read(path)
-        (rest,) = read(path, damaged="skip")
-        for channel in READINGS:
-            np.testing.assert_array_equal(getattr(rest, channel), getattr(whole, channel)[: len(rest.time_s)])
 
 
 def recording(time_s: list[float], joints: int = 7, **channels: np.ndarray) -> Recording:

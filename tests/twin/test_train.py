@@ -203,12 +203,6 @@ def test_kl_is_that_of_torch_distributions():
     torch.testing.assert_close(kl(mu, logvar), kl_divergence(posterior, prior))
 
 
-def test_beta_weighs_the_kl_and_that_of_the_prior_is_zero():
-    x, mu, logvar = torch.zeros(4, 1, 3, 2), torch.ones(1, 2, 2), torch.zeros(1, 2, 2)
-    assert [negative_elbo(x, x, mu, logvar, beta).item() for beta in (1.0, 4.0)] == [1.0, 4.0]
-    assert kl(torch.zeros(1, 2), torch.zeros(1, 2)).item() == 0.0
-
-
 def test_a_latent_that_never_moves_is_not_active_and_none_or_little_kl_counts_as_collapsed():
     assert active_units(torch.stack([torch.linspace(-1, 1, 50), torch.full((50,), 0.4)])) == 1
     assert [collapsed(0.4, 1), collapsed(3.0, 0), collapsed(0.6, 1)] == [True, True, False]

@@ -99,22 +99,14 @@ def test_another_number_of_joints_is_refused(folder):
         load(folder, joints=6)
 
 
-def test_a_round_trip_keeps_every_bit_of_the_score(twin, folder, plan):
-    back = load(folder)
-    assert back.version == twin.version
-    assert (back.arm, back.data_hash, back.seed) == (twin.arm, twin.data_hash, twin.seed)
-    assert back.config == twin.config
-    assert back.fits == twin.fits
-    np.testing.assert_array_equal(back.score(plan, 5).per_joint, twin.score(plan, 5).per_joint)
-
-
-@pytest.mark.parametrize("change", [{"layers": 2, "latent": 3}, {"scope": "arm"}, {"kind": "ae"}])
+@pytest.mark.parametrize("change", [{}, {"layers": 2, "latent": 3}, {"scope": "arm"}, {"kind": "ae"}])
 def test_every_kind_of_twin_comes_back(records, small, tmp_path, plan, change):
     config = replace(small, **change, epochs=1, allow_collapse=True)
     other = train(records[:3], config, np.random.SeedSequence(0), arm="b")
     save(other, tmp_path)
     back = load(tmp_path)
-    assert back.version == other.version
+    assert (back.version, back.arm, back.data_hash, back.seed) == (other.version, "b", other.data_hash, other.seed)
+    assert (back.config, back.fits) == (other.config, other.fits)
     np.testing.assert_array_equal(back.score(plan, 2).per_joint, other.score(plan, 2).per_joint)
 
 
@@ -167,16 +159,6 @@ def test_windows_of_an_arm_go_through_each_network_alone(config, count, joints, 
     variance = np.stack([each.exp().numpy() for _, _, each in outputs], axis=1)
     np.testing.assert_allclose(sigma, np.sqrt(variance), rtol=1e-5)
     np.testing.assert_allclose(networks.decode(mu, config.window), want, atol=2e-6)
-
-
-@pytest.mark.parametrize("count", [2, 7])
-def test_joints_share_no_numbers(count):
-    networks, z = Networks([weights_of(net) for net in several(count, TwinConfig(hidden=8))]), drawn(1, 4, 50, count, 3)
-    other = z.copy()
-    other[:, :, -1] += 1.0
-    before, after = networks.reconstruct(z)[0], networks.reconstruct(other)[0]
-    np.testing.assert_array_equal(before[:, :, :-1], after[:, :, :-1])
-    assert np.abs(before[:, :, -1] - after[:, :, -1]).max() > 1e-3
 
 
 def test_many_windows_in_several_passes_are_each_window_alone():
@@ -249,14 +231,6 @@ def test_the_job_error_is_the_mean_over_its_time(twin, plan):
     times = np.array([3.0, 4 * 10.0, 2.5])
     want = (times[:, None, None] * per_phase).sum(0) / times.sum()
     np.testing.assert_allclose(job_errors(twin, plan, 4), want)
-
-
-def test_the_phase_error_is_the_plain_mean_of_the_reconstruction_error(twin, make_plan, motion, rng):
-    whole_windows_s = 8 * twin.config.window / 12.5
-    plan = make_plan(motion(rng, 4.0), motion(rng, whole_windows_s), motion(rng, 4.0))
-    windows = cut(resample(plan.cycle.profile, 50.0, 12.5), twin.config.window, twin.config.window)
-    away = np.abs(windows - twin.reconstruct(windows)) / twin.scaler.std
-    np.testing.assert_allclose(phase_errors(twin, plan)[1], away.mean(axis=(0, 1)), rtol=1e-4)
 
 
 def test_an_empty_phase_weighs_nothing(twin, plan):
