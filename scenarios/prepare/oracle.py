@@ -1,6 +1,6 @@
 """The true models of an arm, which only the simulator knows."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,6 +12,27 @@ from fleet.motion import Plan, drives
 from twin.thermal.thermal_twin import LinearHeat, peak_forecast
 
 Array = np.ndarray
+
+
+def peaks(
+    plans: Sequence[Plan],
+    duration_s: Sequence[float],
+    *,
+    motors: Motors,
+    thermal: ThermalModel,
+    start_c: Array,
+    ambient_c: float,
+) -> Array:
+    """Hottest winding temperature of each joint while one arm repeats the cycle of each plan, °C, [plan, joint].
+
+    Args:
+        duration_s: Time during which the cycle repeats, [plan].
+        start_c: Initial temperatures, [node].
+    """
+    load = drives([plan.cycle.profile for plan in plans], motors)
+    return simulate_temperatures(
+        load, duration_s, motors=motors, thermal=thermal, start_c=start_c, ambient_c=ambient_c
+    ).highest_c
 
 
 SURE_K = 0.15
@@ -40,14 +61,14 @@ class Oracle:
     def score(self, plan: Plan, repetitions: int) -> Difficulty:
         """Difficulty of the repeated plan from idle equilibrium, and its peak as a function of known temperatures."""
         plan = self.executed.get(plan, plan)
-        peak = simulate_temperatures(
-            drives([plan.cycle.profile], self.motors),
+        peak = peaks(
+            [plan],
             [plan.duration_s(repetitions)],
             motors=self.motors,
             thermal=self.thermal,
             start_c=self.start_c,
             ambient_c=self.ambient_c,
-        ).highest_c[0]
+        )[0]
         start = self.start_c[WINDING]
         room = np.maximum(self.warning_c - start, 1.0)
         heat = LinearHeat.of(drives([phase.profile for phase in plan.phases], self.motors), self.motors, self.thermal)

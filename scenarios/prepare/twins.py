@@ -22,10 +22,11 @@ from fleet.arm.plan_cache import RANDOM_MOTIONS_VERSION
 from fleet.errors import CheckpointError, FleetError, nearest
 from fleet.files import cache_folder
 from fleet.heat.motor import Motors
-from fleet.heat.thermal import NODES, ThermalModel, simulate_temperatures
-from fleet.motion import RATE_HZ, Plan, drives
+from fleet.heat.thermal import NODES, ThermalModel
+from fleet.motion import RATE_HZ, Plan
 from scenarios.extras import require_extra
 from scenarios.prepare.arms import ArmHardware, PlannedArm, plan_arms
+from scenarios.prepare.oracle import peaks
 from scenarios.progress import Count, Progress, quiet
 from scenarios.result_folder import ResultKind
 from scenarios.spec.jobs import rehearsal_works
@@ -53,12 +54,8 @@ def cold_peaks(
     plans: Sequence[Plan], motors: Motors, thermal: ThermalModel, *, ambient_c: float, horizon_s: float
 ) -> Array:
     """Hottest winding temperatures when each plan's cycle repeats over the horizon from ambient, °C, [plan, joint]."""
-    load, lasts_s = drives([plan.cycle.profile for plan in plans], motors), [horizon_s] * len(plans)
-    start_c = np.full(NODES, ambient_c)
-    simulated = simulate_temperatures(
-        load, lasts_s, motors=motors, thermal=thermal, start_c=start_c, ambient_c=ambient_c
-    )
-    return simulated.highest_c
+    cold_c, lasts_s = np.full(NODES, ambient_c), [horizon_s] * len(plans)
+    return peaks(plans, lasts_s, motors=motors, thermal=thermal, start_c=cold_c, ambient_c=ambient_c)
 
 
 def cool_plans(plans: Sequence[Plan], hardware: ArmHardware, spec: TwinSpec) -> tuple[Plan, ...]:

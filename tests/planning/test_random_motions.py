@@ -19,12 +19,12 @@ from fleet.arm.planner import Planner
 from fleet.arm.random_motions import light_jobs, plan_motion, random_jobs
 from fleet.errors import FleetError, InfeasibleJob
 from fleet.heat.motor import gen3_motors
-from fleet.heat.thermal import gen3_network, thermal_model
+from fleet.heat.thermal import NODES, gen3_network, thermal_model
 from fleet.job import Place, Work
 from fleet.motion import RATE_HZ
 from fleet.robot import GEN3, JOINTS, POSTURES, RATING, Mount, Robot, angles_deg, rotation
 from scenarios.motion.hold import hold
-from scenarios.prepare.twins import cold_peaks
+from scenarios.prepare.oracle import peaks
 
 NEAR = np.array([0.3, 0.1, np.pi, -2.1, 0.1, 0.9, 1.5])
 FAR = np.array([-0.3, 1.0, np.pi, -0.7, 0.0, 0.9, 1.5])
@@ -47,7 +47,14 @@ def light():
 
 
 def peaks_c(plans, ambient_c=23.0):
-    return cold_peaks(plans, gen3_motors(), thermal_model(gen3_network()), ambient_c=ambient_c, horizon_s=1800.0)
+    return peaks(
+        plans,
+        [1800.0] * len(plans),
+        motors=gen3_motors(),
+        thermal=thermal_model(gen3_network()),
+        start_c=np.full(NODES, ambient_c),
+        ambient_c=ambient_c,
+    )
 
 
 def test_it_leaves_home_cycles_and_comes_home_without_a_jump(arm):

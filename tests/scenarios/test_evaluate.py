@@ -16,17 +16,8 @@ from fleet.difficulty import KNOWN
 from fleet.engine.shift import initial, step
 from fleet.engine.world import warm_start
 from fleet.heat.motor import gen3_motors
-from fleet.heat.thermal import (
-    NODES,
-    WINDING,
-    drive_heat,
-    gen3_network,
-    node_heat,
-    simulate_temperatures,
-    steady_state,
-    thermal_model,
-)
-from fleet.motion import Plan, drive, drives
+from fleet.heat.thermal import NODES, WINDING, drive_heat, gen3_network, node_heat, steady_state, thermal_model
+from fleet.motion import Plan, drive
 from fleet.robot import ThermalLimits
 from fleet.seeding import shift_seeds
 from scenarios.evaluate.rollout import FIGURES, Outcome, outcomes
@@ -35,7 +26,7 @@ from scenarios.evaluate.statistics import interval
 from scenarios.evaluate.study import Case, Row, RowKey
 from scenarios.policy_loader import PolicyFailed, policy_of
 from scenarios.prepare.fleet import Fleet, prepare, with_surprises
-from scenarios.prepare.oracle import Oracle
+from scenarios.prepare.oracle import Oracle, peaks
 from scenarios.run.shift import run
 from scenarios.spec.jobs import JobSampler, downtime_s, fault_price, weights_of
 from scenarios.spec.load import load
@@ -326,13 +317,6 @@ def plan_of(small, payload_kg: float) -> Plan:
     return small.arm(0, [content]).plans[content][0]
 
 
-def peaks(plans, duration_s, start_c, ambient_c):
-    """Hottest winding temperatures while the cycle of each plan repeats, °C, [plan, joint]."""
-    load = drives([plan.cycle.profile for plan in plans], MOTORS)
-    law = {"motors": MOTORS, "thermal": THERMAL, "ambient_c": ambient_c}
-    return simulate_temperatures(load, duration_s, start_c=start_c, **law).highest_c
-
-
 def oracle(start_c=None) -> Oracle:
     start = np.full(14, 25.0) if start_c is None else start_c
     return Oracle(MOTORS, THERMAL, start, 25.0, 60.0)
@@ -349,7 +333,7 @@ def test_peaks_equal_those_of_a_shift(small, payload_kg, repetitions) -> None:
         state = step(world, state, np.array([[int(tick == 0)]]), plant).state
     plan = arms[0].plans[content][0]
     start = np.full(14, 25.0)
-    (actual,) = peaks([plan], [10.0 * repetitions], start, 25.0)
+    (actual,) = peaks([plan], [10.0 * repetitions], motors=MOTORS, thermal=THERMAL, start_c=start, ambient_c=25.0)
     assert actual == pytest.approx(state.temp_c[0, 0, WINDING], abs=5e-5)  # the engine has temperatures in float32
     assert actual.max() == pytest.approx(state.peak_c[0, 0], abs=5e-5)
 
@@ -366,12 +350,12 @@ def test_heating_time_is_the_duration_of_the_plan(small, duration_s) -> None:
 
     law = solve_ivp(slope, (0.0, duration_s), start, rtol=1e-9, atol=1e-9).y[WINDING]
     other = plan_of(small, 0.0)  # other plans in the same call have no effect
-    actual = peaks([plan, other], [duration_s, 55.0], start, 25.0)
+    actual = peaks([plan, other], [duration_s, 55.0], motors=MOTORS, thermal=THERMAL, start_c=start, ambient_c=25.0)
     assert actual[0, 1] == pytest.approx(law[1].max(), abs=0.01 + 0.02 * (law[1].max() - 30.0))
 
 
 def test_no_plans_have_no_peaks() -> None:
-    assert peaks([], [], np.zeros(14), 0.0).shape == (0, 7)
+    assert peaks([], [], motors=MOTORS, thermal=THERMAL, start_c=np.zeros(14), ambient_c=0.0).shape == (0, 7)
 
 
 def test_more_payload_or_more_repetitions_is_never_easier(small) -> None:
@@ -394,7 +378,9 @@ def test_p_is_that_of_the_true_motors_from_any_state(small) -> None:
         ambient_c = rng.uniform(15.0, 40.0)
         housing_c = ambient_c + rng.uniform(0.0, 22.0, 7)
         start_c = np.concatenate([housing_c + rng.uniform(0.0, 4.0, 7), housing_c])
-        (peak,) = peaks([plan], [plan.duration_s(60)], start_c, ambient_c)
+        (peak,) = peaks(
+            [plan], [plan.duration_s(60)], motors=MOTORS, thermal=THERMAL, start_c=start_c, ambient_c=ambient_c
+        )
         known_c = np.append(start_c, ambient_c)
         if start_c[:7].max() < peak.max() < 80.0:
             assert score.peak_at(known_c) == pytest.approx(peak.max(), abs=0.6)
@@ -407,7 +393,9 @@ def test_p_is_that_of_the_true_motors_from_any_state(small) -> None:
 def test_difficulty_follows_its_formula(small) -> None:
     plan = plan_of(small, 4.0)
     score = oracle().score(plan, 30)
-    (peak,) = peaks([plan], [plan.duration_s(30)], np.full(14, 25.0), 25.0)
+    (peak,) = peaks(
+        [plan], [plan.duration_s(30)], motors=MOTORS, thermal=THERMAL, start_c=np.full(14, 25.0), ambient_c=25.0
+    )
     assert score.per_joint == pytest.approx([1.0 - math.exp(-(c - 25.0) / (60.0 - 25.0)) for c in peak])
 
 

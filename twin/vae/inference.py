@@ -13,7 +13,7 @@ import numpy as np
 
 from fleet.jit import fused, jit_inline, kernel
 from fleet.motion import CHANNELS
-from twin.vae.config import LOGVAR_RANGE
+from twin.vae.config import LOGVAR_RANGE, TwinConfig
 
 Array = np.ndarray
 
@@ -142,6 +142,28 @@ Weights = Mapping[str, Array]
 
 _CHUNK = 128
 """Windows per pass: keeps the activations in cache."""
+
+
+def shapes(config: TwinConfig, channels: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of the parameters of one network."""
+    hidden, latent = config.hidden, config.latent
+    sizes: dict[str, tuple[int, ...]] = {}
+    for lstm, size in (("encoder", channels), ("decoder", hidden)):
+        for layer in range(config.layers):
+            sizes[f"{lstm}.weight_ih_l{layer}"] = 4 * hidden, hidden if layer else size
+            sizes[f"{lstm}.weight_hh_l{layer}"] = 4 * hidden, hidden
+            sizes[f"{lstm}.bias_ih_l{layer}"] = sizes[f"{lstm}.bias_hh_l{layer}"] = (4 * hidden,)
+    linear = {
+        "summary": (hidden, hidden),
+        "mu": (latent, hidden),
+        "expand": (hidden, latent),
+        "out": (channels, hidden),
+    }
+    if config.kind == "vae":
+        linear["logvar"] = latent, hidden
+    for name, (rows, columns) in linear.items():
+        sizes[f"{name}.weight"], sizes[f"{name}.bias"] = (rows, columns), (rows,)
+    return sizes
 
 
 class Networks:

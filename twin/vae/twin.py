@@ -21,7 +21,7 @@ from fleet.json_file import check_version, read_card, write_card
 from fleet.motion import CHANNELS, Plan
 from fleet.robot import JOINTS
 from twin.vae.config import TwinConfig
-from twin.vae.inference import Networks, Weights
+from twin.vae.inference import Networks, Weights, shapes
 from twin.vae.measures import PARTS, TAU, Calibration, Features, Measures, latent_moments, measures_of, moments
 from twin.vae.window import PHASES, PlanCache, Scaler, check_jobs, cut_phases
 
@@ -308,16 +308,18 @@ def load(folder: Path, *, joints: int = JOINTS) -> Twin:
     if len(card.turn_q) != joints:
         raise CheckpointError(f"{folder / CARD}: the twin has {len(card.turn_q)} joints, the arm has {joints}.")
     scaler = Scaler(*(np.array(getattr(card, field.name)) for field in fields(Scaler)))
+    if {len(part) for part in (scaler.mean, scaler.std, scaler.still)} != {joints}:
+        raise CheckpointError(f"{folder / CARD}: mean, std and still must each have {joints} joints.")
+    wanted = shapes(card.config, card.config.channels(joints))
     try:
         tensors = load_file(folder / WEIGHTS)
         calibration = Calibration(Features(tensors.pop(REFERENCE)), tensors.pop(GROUP)) if card.calibrated else None
-        names = net_names(card.config, joints)
-        if wrong := [name for name, tensor in tensors.items() if tensor.dtype != np.float32]:
-            raise ValueError(f"'{wrong[0]}' is not float32")
         nets = [
-            {name.removeprefix(f"{net}."): tensor for name, tensor in tensors.items() if name.startswith(f"{net}.")}
-            for net in names
+            {name: _tensor(tensors, f"{net}.{name}", shape) for name, shape in wanted.items()}
+            for net in net_names(card.config, joints)
         ]
+        if tensors:
+            raise ValueError(f"unknown tensors {', '.join(sorted(tensors))}")
         shared = {name: getattr(card, name) for name in _SHARED}
         twin = Twin(scaler=scaler, nets=tuple(nets), calibration=calibration, **shared)
     except FileNotFoundError:
@@ -328,3 +330,11 @@ def load(folder: Path, *, joints: int = JOINTS) -> Twin:
         raise CheckpointError(f"{folder / WEIGHTS} does not fit {CARD}: {' '.join(str(error).split())}") from error
     check_version(folder, card.version, twin.version)
     return twin
+
+
+def _tensor(tensors: dict[str, Array], name: str, shape: tuple[int, ...]) -> Array:
+    """Take a tensor out; raises KeyError or ValueError."""
+    tensor = tensors.pop(name)
+    if tensor.shape != shape or tensor.dtype != np.float32:
+        raise ValueError(f"'{name}' is {tensor.dtype} {list(tensor.shape)}, not float32 {list(shape)}")
+    return tensor
