@@ -68,7 +68,7 @@ class _Database(Protocol):
 
     @property
     def system_errno(self) -> int: ...
-    def execute(self, statement: str, values: tuple[int | str, ...] = ()) -> Iterator[tuple[int, str, int]]: ...
+    def execute(self, statement: str, values: tuple[int | str, ...] = ()) -> Iterator[tuple[int, bytes, int]]: ...
     def pragma(self, name: str, value: str) -> object: ...
     def close(self) -> None: ...
     def __enter__(self) -> object: ...
@@ -152,9 +152,8 @@ class Journal(Generic[Record]):
         Raises:
             JournalError: it is damaged, or of another version.
         """
-        end = _End()
-        for row, content, crc in self._opened().execute("SELECT row, records, crc FROM journal ORDER BY row"):
-            line = content.encode()
+        end, rows = _End(), "SELECT row, IFNULL(CAST(records AS BLOB), x''), crc FROM journal ORDER BY row"
+        for row, line, crc in self._opened().execute(rows):
             end = end.after(line)
             if (row, crc) != (end.row, end.crc):
                 raise JournalError(f"{self.path}, row {end.row}: damaged (wrong checksum). {_REMEDY}")
@@ -227,7 +226,9 @@ class Journal(Generic[Record]):
 
     def _failure(self, error: OSError | apsw.Error, tried: str) -> JournalError:
         number = error.errno if isinstance(error, OSError) else 0 if self._db is None else self._db.system_errno
-        if isinstance(error, apsw.FullError) or number in _FULL:
+        tells = isinstance(error, OSError | apsw.CantOpenError)  # otherwise it may be the number of an earlier error
+        tells |= getattr(error, "extendedresult", 0) == apsw.SQLITE_IOERR_WRITE
+        if isinstance(error, apsw.FullError) or (tells and number in _FULL):
             return JournalFull(f"Journal '{self.path}' cannot be {tried}: no space left on the disk.")
         if isinstance(error, apsw.BusyError):
             return JournalError(
@@ -235,7 +236,7 @@ class Journal(Generic[Record]):
             )
         if isinstance(error, apsw.NotADBError | apsw.CorruptError):
             return JournalError(f"Journal '{self.path}' is damaged, or of another version ({error}). {_REMEDY}")
-        why = error.strerror if isinstance(error, OSError) else os.strerror(number) if number else str(error)
+        why = error.strerror if isinstance(error, OSError) else os.strerror(number) if tells and number else str(error)
         return JournalError(f"Journal '{self.path}' cannot be {tried}: {why}.")
 
 

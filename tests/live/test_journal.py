@@ -124,6 +124,9 @@ def test_a_log_that_ends_at_any_byte_gives_the_appends_before(tmp_path_factory, 
         "DELETE FROM journal WHERE row = 2",
         "INSERT INTO journal SELECT row + 3, records, crc FROM journal WHERE row = 2",
         "UPDATE journal SET row = row + 1 WHERE row = 3",
+        "UPDATE journal SET records = NULL WHERE row = 2",
+        "UPDATE journal SET records = x'ff' WHERE row = 2",
+        "UPDATE journal SET crc = NULL WHERE row = 2",
     ],
 )
 def test_a_changed_missing_or_repeated_row_is_refused(tmp_path, change):
@@ -196,12 +199,22 @@ def test_a_full_disk_leaves_the_journal_unchanged(disk):
     assert read(disk.path("j")) == [Text("kept"), Text("space again")]
 
 
-@pytest.mark.parametrize("number", [errno.EDQUOT, errno.EFBIG])
-def test_an_exceeded_quota_is_a_full_disk(tmp_path, number):
-    """SQLite tells them from other errors of writing by the number of the system."""
+@pytest.mark.parametrize(
+    ("number", "of", "is_full"),
+    [
+        (errno.EDQUOT, apsw.SQLITE_IOERR_WRITE, True),
+        (errno.EFBIG, apsw.SQLITE_IOERR_WRITE, True),
+        (errno.EIO, apsw.SQLITE_IOERR_WRITE, False),
+        (errno.ENOSPC, apsw.SQLITE_IOERR_FSYNC, False),
+    ],
+)
+def test_an_exceeded_quota_is_a_full_disk_unless_the_sync_fails(tmp_path, number, of, is_full):
+    """SQLite tells them from other errors of writing by the number of the system; after a sync nothing is certain."""
     journal = Journal(tmp_path / "j", KIND)
     journal._db = SimpleNamespace(system_errno=number)
-    assert isinstance(journal._failure(apsw.IOError("disk I/O error"), "written"), JournalFull)
+    error = apsw.IOError("disk I/O error")
+    error.extendedresult = of
+    assert isinstance(journal._failure(error, "written"), JournalFull) == is_full
 
 
 def test_after_a_failed_sync_further_writes_are_refused_until_it_is_reopened(disk):
