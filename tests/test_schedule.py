@@ -93,6 +93,15 @@ def test_breaks_end_as_planned_where_a_failure_hides_their_end():
     ]  # fmt: skip
 
 
+def test_breaks_that_adjoin_are_one_with_the_end_of_the_last():
+    """50 to 100 s and 100 to 200 s: the arm tells one begin and one end."""
+    log = [
+        Event(time_s=50.0, kind="break", arm="arm_0", value=50.0),
+        Event(time_s=200.0, kind="break_end", arm="arm_0"),
+    ]
+    assert [(each.start_s, each.end_s) for each in schedule(log, ARMS, HORIZON_S).breaks] == [(50.0, 200.0)]
+
+
 @pytest.mark.parametrize(
     ("home_s", "breaks"),
     [(250.0, [(250.0, 400.0)]), (450.0, []), (None, [])],

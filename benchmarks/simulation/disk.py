@@ -24,6 +24,9 @@ class Crash(BaseException):  # no handler of the product may catch it
         self.power = power
 
 
+SECTOR = 512
+
+
 @dataclass(eq=False)
 class File:
     """Content of a file, and the writes that are not written through."""
@@ -62,8 +65,9 @@ class File:
             del self.data[size:]
         for start, content, _, _ in lost:
             if (chance := rng.random()) < 0.7:
-                torn = content if content is None or chance < 0.5 else content[: rng.randrange(len(content) + 1)]
-                self._change(start, torn)
+                if content is not None and chance > 0.5:  # a disk writes whole sectors
+                    content = content[: SECTOR * rng.randrange(len(content) // SECTOR + 1)]
+                self._change(start, content)
 
 
 class Disk:
@@ -227,6 +231,9 @@ class DiskPath:
 
     def touch(self, mode: int = 0o666) -> None:
         self.disk.close(self.disk.open(self, 0, mode))
+
+    def is_dir(self) -> bool:
+        return self.name == ""
 
     def exists(self) -> bool:
         return self.name in self.disk.names

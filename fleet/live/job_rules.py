@@ -5,6 +5,7 @@
 
 from collections import deque
 from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
+from datetime import timedelta
 from hashlib import blake2b
 from itertools import accumulate
 from struct import iter_unpack, pack
@@ -289,7 +290,7 @@ def joined_reasons(before: str, now: str) -> str:
 def why_not_ready(job: JobSpec, time_s: float, finished: Callable[[str], bool], busy: Container[str]) -> str:
     """Return why a waiting job cannot be begun by any arm now; "" if it can. Arguments as of `ready_jobs`."""
     if job.release_s > time_s:
-        return f"It is released at {job.release_s:.0f} s of fleet time."
+        return f"It is released at {timedelta(seconds=round(job.release_s))} of fleet time."
     for before in job.after:
         if not finished(before):
             return f"It waits for '{before}'."

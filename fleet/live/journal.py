@@ -1,8 +1,9 @@
 """Journal of one participant: records are durable before they take effect.
 
 A table of an SQLite database: each row is one `append`, the records as a JSON array, with a CRC-32 of all rows so far,
-so that a changed, missing or repeated row is noticed. With a write-ahead log and `synchronous = FULL` an append is on
-disk, or is not there after a crash (https://sqlite.org/wal.html). A damaged journal does not open.
+so that a changed, missing or repeated row before the last is noticed. With a write-ahead log and `synchronous = FULL`
+an append is on disk, or is not there after a crash (https://sqlite.org/wal.html). A damaged journal does not open;
+SQLite ignores a log from its first damaged page on, and here more than one step behind that is damage.
 
 Journals of arms and auctioneers share the record types in this file; each adds its own. Times are fleet seconds, 0 for
 unknown. A journal is compacted when it has grown.
@@ -11,6 +12,7 @@ unknown. A journal is compacted when it has grown.
 import errno
 import logging
 import os
+import struct
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
@@ -32,9 +34,12 @@ COMPACT_FACTOR, COMPACT_BYTES = 4, 1_000_000
 Record = TypeVar("Record", bound=msgspec.Struct)
 
 _REMEDY = (
-    "Restore a copy. Without its journal a participant has lost its jobs, and may do them twice: see Epochs in "
-    "docs/bus/auctioneer.md before you move the file away."
+    "Restore a copy in place of both, the file and its log with '-wal' in the name. Without its journal a participant "
+    "has lost its jobs, and may do them twice: see Epochs in docs/bus/auctioneer.md before you move it away."
 )
+_LOG_HEAD, _FRAME_HEAD = struct.Struct(">8I"), struct.Struct(">4I8x")
+"""Heads of a write-ahead log and of a frame (https://sqlite.org/fileformat2.html#the_write_ahead_log): magic number,
+version, page size, sequence, two salts and two checksums; page, pages after a commit or 0, and the salts."""
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -70,6 +75,7 @@ class _Database(Protocol):
     def system_errno(self) -> int: ...
     def execute(self, statement: str, values: tuple[int | str, ...] = ()) -> Iterator[tuple[int, bytes, int]]: ...
     def pragma(self, name: str, value: str) -> object: ...
+    def config(self, option: int, value: int) -> int: ...
     def close(self) -> None: ...
     def __enter__(self) -> object: ...
     def __exit__(self, *exc: Any) -> bool | None: ...
@@ -119,13 +125,17 @@ class Journal(Generic[Record]):
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self.path.touch(mode=0o600)  # SQLite gives its log the same mode
             self._db = cast(_Database, apsw.Connection(str(self.path)))
+            self._db.config(apsw.SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, 1)  # what is refused stays as it is
             self._db.pragma("locking_mode", "exclusive")
             self._db.pragma("journal_mode", "wal")
             self._db.pragma("synchronous", "full" if self._durable else "off")
+            if commits := self._commits_of_log():  # the file is locked now
+                self._check_log(self._db, commits)
             self._db.execute("CREATE TABLE IF NOT EXISTS journal (row INTEGER PRIMARY KEY, records TEXT, crc INTEGER)")
             for _ in self.records():
                 pass
-        except (OSError, apsw.Error) as error:
+            self._db.config(apsw.SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, 0)
+        except (OSError, apsw.Error, UnicodeEncodeError) as error:
             failure = self._failure(error, "opened")
             self.close()
             raise failure from error
@@ -205,6 +215,42 @@ class Journal(Generic[Record]):
             raise JournalError(f"Journal '{self.path}' is not open.")
         return self._db
 
+    def _commits_of_log(self) -> list[int]:
+        """Return the numbers of the frames of the log that end a transaction, from 1; none without a log.
+
+        Raises:
+            JournalError: its head is damaged.
+        """
+        log = self.path.with_name(f"{self.path.name}-wal")
+        content = log.read_bytes() if log.exists() else b""
+        if len(content) < _LOG_HEAD.size or not any(content[: _LOG_HEAD.size]):
+            return []
+        magic, _, page_bytes, _, *salts, first, second = _LOG_HEAD.unpack_from(content)
+        words = struct.unpack_from(">6I" if magic & 1 else "<6I", content)
+        sums = [0, 0]
+        for one, two in zip(words[::2], words[1::2], strict=True):
+            sums[0] = (sums[0] + one + sums[1]) % 2**32
+            sums[1] = (sums[1] + two + sums[0]) % 2**32
+        if sums != [first, second]:
+            raise JournalError(f"'{log}' is damaged (wrong checksum of its head). {_REMEDY}")
+        frames = range(_LOG_HEAD.size, len(content) - _FRAME_HEAD.size + 1, _FRAME_HEAD.size + page_bytes)
+        heads = [_FRAME_HEAD.unpack_from(content, start) for start in frames]
+        return [number for number, (_, pages, *own) in enumerate(heads, start=1) if pages and own == salts]
+
+    def _check_log(self, db: _Database, commits: list[int]) -> None:
+        """Compare the log with what SQLite has taken from it, and begin a new one.
+
+        Raises:
+            JournalError: it is damaged in the middle.
+        """
+        ((_, taken, _),) = db.execute("PRAGMA wal_checkpoint(NOOP)")
+        left_out = sum(number > int(taken) for number in commits)
+        if left_out > 1:  # a crash leaves one, which nobody has been told of
+            raise JournalError(f"'{self.path}-wal' is damaged: {left_out} steps at its end cannot be read. {_REMEDY}")
+        if left_out:
+            _LOG.warning("%s: left out the last step of its log, which was not complete.", self.path)
+        db.pragma("wal_checkpoint", "truncate")
+
     def _write(self, records: tuple[Record, ...], *, replace: bool = False) -> None:
         if self._broken:
             raise JournalError(self._broken)
@@ -224,7 +270,7 @@ class Journal(Generic[Record]):
             raise failure from error
         self._end = end
 
-    def _failure(self, error: OSError | apsw.Error, tried: str) -> JournalError:
+    def _failure(self, error: OSError | apsw.Error | UnicodeEncodeError, tried: str) -> JournalError:
         number = error.errno if isinstance(error, OSError) else 0 if self._db is None else self._db.system_errno
         tells = isinstance(error, OSError | apsw.CantOpenError)  # otherwise it may be the number of an earlier error
         tells |= getattr(error, "extendedresult", 0) == apsw.SQLITE_IOERR_WRITE
@@ -234,10 +280,15 @@ class Journal(Generic[Record]):
             return JournalError(
                 f"Journal '{self.path}' is in use by another process. Stop that process, or choose another folder."
             )
-        if isinstance(error, apsw.NotADBError | apsw.CorruptError):
+        outside = apsw.CantOpenError | apsw.IOError | apsw.PermissionsError | apsw.ReadOnlyError
+        if isinstance(error, apsw.Error) and not isinstance(error, outside):
             return JournalError(f"Journal '{self.path}' is damaged, or of another version ({error}). {_REMEDY}")
         why = error.strerror if isinstance(error, OSError) else os.strerror(number) if tells and number else str(error)
-        return JournalError(f"Journal '{self.path}' cannot be {tried}: {why}.")
+        if isinstance(error, UnicodeEncodeError):
+            why = "its path is no text in UTF-8"
+        elif isinstance(error, apsw.ReadOnlyError | apsw.CantOpenError) and not self.path.is_dir():
+            why = "it needs a file and a folder that this user may read and write"
+        return JournalError(f"Journal '{printable(str(self.path))}' cannot be {tried}: {why}.")
 
 
 class Started(msgspec.Struct, frozen=True, tag="started"):

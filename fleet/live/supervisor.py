@@ -285,7 +285,7 @@ class Supervisor:
         with process.stdout as output:
             for line in output:
                 log.write(line)
-                if line.startswith(running.part.ready):
+                if line.startswith(running.part.ready) and running.process is process:
                     running.ready.set()
 
     def _await_exit(self, running: _Running, process: "subprocess.Popen[str]") -> None:

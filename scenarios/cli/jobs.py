@@ -1,6 +1,5 @@
 """Commands that steer a live fleet: `thermofleet job` and `thermofleet arm pause | reset | clear`."""
 
-from contextlib import suppress
 from typing import TYPE_CHECKING, Literal
 
 import typer
@@ -10,7 +9,7 @@ from fleet.fields import argument, option
 from fleet.job import BOUNDS, DWELL_S
 from scenarios.cli import options
 from scenarios.table import Table
-from scenarios.terminal import print_json, print_lines, say
+from scenarios.terminal import err_console, print_json, print_lines, say
 
 if TYPE_CHECKING:  # the bus, which other commands do not load
     from fleet.bus.protocol.auction import JobStatus
@@ -117,11 +116,15 @@ def list_command(
         snapshot = listener.view.snapshot(time.monotonic())
         known = {job.job: job for job in snapshot.jobs if not names or job.job in names}
         now_s = max((arm.time_s or 0.0 for arm in snapshot.arms), default=0.0)
-        with suppress(NoReply, Refused):  # results tell neither predicted ends nor why jobs wait
+        try:  # results tell neither predicted ends nor why jobs wait
             asked = StatusRequest(tuple(names or ()))
             now = link.ask(keys.of_jobs(link.fleet, "status"), asked, Status, timeout_s=LISTEN_S)
             known |= {job.job: job for job in now.jobs}
             now_s = max(now_s, now.time_s)
+        except (NoReply, Refused) as error:
+            if not known:
+                raise FleetError(f"Nobody tells of jobs: {error}") from error
+            say(f"These are the last known changes: {error}", err_console)
     jobs = sorted(known.values(), key=lambda status: status.job)
     if unknown := sorted({*(names or ())} - {job.job for job in jobs}):
         near = nearest(unknown[0], [job.job for job in snapshot.jobs])

@@ -111,13 +111,14 @@ def run_fleet(
     from scenarios.prepare.fleet import prepare
 
     chosen = load(scenario)
+    if page:
+        _check_page(tls, webhooks)
     fleet, folder = folder_of(out, spec.fleet, chosen)
+    _refuse_other_fleet(folder, fleet)
     if tls is not None and fleet != chosen.name:
         raise FleetError(f"The keys of --tls are for the fleet of their scenario; leave --fleet out (got '{fleet}').")
     names = chosen_arms(arms, tuple(arm.name for arm in chosen.arms))
     _check_place(arms, router, host, names[0], tls)
-    if page:
-        _check_page(tls, webhooks)
     if tls is not None:
         check_roster(tls, scenario)
     if plans(spec.policy):  # before anything is started
@@ -180,6 +181,19 @@ def run_fleet(
     if not router:
         say(f"Recorded in {folder / 'recording'}.", out_console)
     stop.leave(f"The fleet was stopped; journals, recording and logs are in {folder}; the same command continues.")
+
+
+def _refuse_other_fleet(folder: Path, fleet: str) -> None:
+    """Refuse the folder of another fleet, whose jobs would be continued with the arms and places of this one.
+
+    Raises:
+        FleetError: its recording is of another fleet, or damaged.
+    """
+    from scenarios.live.recording import CARD, read_card
+
+    recording = folder / "recording"
+    if (recording / CARD).exists() and (other := read_card(recording).fleet) != fleet:
+        raise FleetError(f"'{folder}' is of fleet '{other}', not of '{fleet}': give another --out.")
 
 
 def page_of(

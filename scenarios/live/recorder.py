@@ -303,9 +303,14 @@ class GapFetcher:
             self._link = None
 
     def _next_senders(self) -> tuple[str, ...]:
-        """Return the senders of the next sweep: those of results and operations, which are few, first."""
+        """Return the senders of the next sweep: those of results and operations, which are few, first.
+
+        Of an auctioneer that is known by its results the only operation may be what is missing.
+        """
         known = sorted({name.partition(", epoch")[0] for name in self._recorder.counts} - {""}, reverse=True)
-        central = [name for name in known if name.startswith(("results", "operations"))][:SWEEP_KEYS]
+        auctioneers = {name.partition(" of ")[2] for name in known if name.startswith(("results", "operations"))}
+        both = [f"{kind} of {name}" for kind in ("results", "operations") for name in sorted(auctioneers)]
+        central = both[:SWEEP_KEYS]
         arms = [name for name in known if name.startswith("events")]
         start, self._swept = self._swept % max(1, len(arms)), self._swept + SWEEP_KEYS
         return (*central, *dict.fromkeys((arms[start:] + arms)[:SWEEP_KEYS]))

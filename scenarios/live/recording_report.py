@@ -77,7 +77,7 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
     events = tuple(event for event in ordered if event.arm in arms)
     telemetry = telemetry_of(table, arms)
     shown = {
-        "status": {"recording": "interrupted"}.get(card.status, card.status),
+        "status": "running" if card.status == "recording" else card.status,
         "scenario": {"name": card.fleet},
         "policy": "live recording",
         "metrics": _metrics(telemetry, events, results, arms, limits.warning_c) | heat_use(table, arms),

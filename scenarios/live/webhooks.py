@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 
 from fleet.bus.protocol.messages import encode
 from fleet.bus.protocol.operator import Alarm
-from fleet.errors import FleetError
+from fleet.errors import FleetError, printable
 
 _LOG = logging.getLogger(__name__)
 
@@ -48,12 +48,12 @@ class Webhook:
             parts = urlsplit(url)
             host, port = parts.hostname or "", parts.port
         except ValueError as error:
-            raise FleetError(f"--webhook: {error} (got '{url}').") from error
+            raise FleetError(f"--webhook: {error} (got '{printable(url)}').") from error
         wrong = parts.scheme not in ("http", "https") or not host or "@" in parts.netloc or port == 0
         if wrong or any(char.isspace() for char in url):
-            raise FleetError(f"--webhook must be a URL such as http://127.0.0.1:9000/alarms (got '{url}').")
+            raise FleetError(f"--webhook must be a URL such as http://127.0.0.1:9000/alarms (got '{printable(url)}').")
         if parts.scheme == "http" and not _is_loopback(host):
-            raise FleetError(f"--webhook beyond this machine must be https:// (got '{url}').")
+            raise FleetError(f"--webhook beyond this machine must be https:// (got '{printable(url)}').")
         self._port = port or (443 if parts.scheme == "https" else 80)
         self.url, self._secret, self._host = url, secret.encode(), host
         self._named = f"[{host}]" if ":" in host else host

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property
 from itertools import zip_longest
-from math import isfinite
+from math import inf, isfinite
 from typing import Any, Literal  # Any: values of a card
 
 import numpy as np
@@ -212,9 +212,10 @@ def _breaks(arm: str, log: Sequence[Event], work: Sequence[JobSpan], horizon_s: 
     if ends and (not begins or ends[0] < begins[0][0]):
         begins.insert(0, (0.0, ends[0]))
     out: list[Outage] = []
-    for begin_s, planned_s in begins:
+    for (begin_s, planned_s), following_s in zip(begins, [*(each for each, _ in begins[1:]), inf], strict=True):
         planned_s = planned_s if isfinite(planned_s) else horizon_s
-        end_s = min((each for each in (*ends, planned_s) if each > begin_s), default=begin_s)
+        # Breaks that adjoin or overlap have one begin and one end.
+        end_s = min((each for each in ends if begin_s < each <= following_s), default=max(begin_s, planned_s))
         over, end_s = end_s <= horizon_s, min(end_s, horizon_s)
         free_s = max((span.end_s for span in work if span.start_s < begin_s), default=0.0)
         if free_s < end_s:

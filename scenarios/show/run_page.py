@@ -76,6 +76,8 @@ def verdict(log: ShiftLog) -> Verdict:
     status = str(log.card.get("status", "unknown"))
     if status == "interrupted":
         badge = f"Interrupted after {duration(plan.horizon_s)}: everything here covers that part only"
+    elif status == "running":
+        badge = f"So far, {duration(plan.horizon_s)}: the recording was not ended, and may still grow"
     else:
         counts = ((len(faults), "fault"), (contacts, "contact"), (len(late), "late job"))
         badge = ", ".join(f"{count} {what}{'s' * (count > 1)}" for count, what in counts if count)

@@ -120,7 +120,7 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
     except ValueError:
         raise ValueError(f"expected seconds, h:mm, h:mm:ss, or {DATE} (got {_shown(cell)})") from None
     if begin is None:
-        raise ValueError(f"a date needs shift_begin, the begin of the shift (got {_shown(cell)})")
+        raise ValueError(f"a date needs shift_begin, the begin of the shift, or --shift-begin (got {_shown(cell)})")
     if not YEARS[0] <= date.year <= YEARS[1]:
         raise ValueError(f"expected a year from {YEARS[0]} to {YEARS[1]} (got {date.year})")
     return since(begin, date if date.tzinfo else date.replace(tzinfo=begin.tzinfo))

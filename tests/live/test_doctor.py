@@ -169,7 +169,7 @@ def test_a_warning_is_no_fault():
         assert word in warned
     assert "'z'" not in warned
     assert [each.what for each in found.findings if each.level == "note"] == [
-        "b is in a break until 900 s of fleet time."
+        "b is in a break until 0:15:00 of fleet time."
     ]
 
 

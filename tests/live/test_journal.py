@@ -116,6 +116,27 @@ def test_a_log_that_ends_at_any_byte_gives_the_appends_before(tmp_path_factory, 
     assert read(folder / "copy") == [*found, Text("after")]
 
 
+@examples(60)
+@given(st.data())
+def test_a_damaged_bit_of_the_log_is_noticed_unless_it_is_in_the_last_step(tmp_path_factory, data):
+    folder = tmp_path_factory.mktemp("journal")
+    whole = [Counted(number) for number in range(20)]
+    with Journal(folder / "j", KIND) as journal:
+        for each in whole:
+            journal.append(each)
+        database, log = ((folder / name).read_bytes() for name in ("j", "j-wal"))
+    log = bytearray(log)
+    log[data.draw(st.integers(0, len(log) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    (folder / "copy").write_bytes(database)
+    (folder / "copy-wal").write_bytes(log)
+    try:
+        found = read(folder / "copy")
+    except JournalError:
+        assert ((folder / "copy").read_bytes(), (folder / "copy-wal").read_bytes()) == (database, log), "changed"
+        return
+    assert found in (whole, whole[:-1])
+
+
 @pytest.mark.parametrize(
     "change",
     [

@@ -72,7 +72,7 @@ def test_a_job_that_cannot_be_begun_yet_says_why() -> None:
     def why(time_s: float, finished: set[str], busy: set[str]) -> str:
         return why_not_ready(job, time_s, finished.__contains__, busy)
 
-    assert why(89.0, set(), {"u"}) == "It is released at 90 s of fleet time."
+    assert why(89.0, set(), {"u"}) == "It is released at 0:01:30 of fleet time."
     assert why(90.0, {"one"}, {"u"}) == "It waits for 'two'."
     assert why(90.0, {"one", "two"}, {"v"}) == "Its place 'v' is in use."
     assert why(90.0, {"one", "two"}, set()) == ""

@@ -227,7 +227,7 @@ FAULTS = {
     "x,hold,bench,,,-1,,,,": "column release: must be between 0 and 1000000000 s (got -1.0).",
     "x,hold,bench,,,soon,,,,": "column release: expected seconds, h:mm, h:mm:ss, or a date with time and zone, as 2026",
     "x,hold,bench,,,6:75,,,,": "column release: expected seconds, h:mm, h:mm:ss, or a date with time and",
-    "x,hold,bench,,,2026-11-23,,,,": "column release: a date needs shift_begin, the begin of the shift (got '",
+    "x,hold,bench,,,2026-11-23,,,,": "column release: a date needs shift_begin, the begin of the shift, or --shift-",
     "x,hold,bench,,,60,30,,,": "column due: must not be before the release at 60 s (got 30 s).",
     "x,hold,bench,,,,,yes,,": "column due: a hard due date needs a time.",
     "x,hold,bench,,,,,maybe,,": "column hard: expected yes or no (got 'maybe').",

@@ -41,6 +41,7 @@ from fleet.live.job_client import batches
 from scenarios.live import auctioneer as live_auction
 from scenarios.live.arm import ambient_of, replayed_arm, wait_for_name
 from scenarios.live.auctioneer import job_spec, refuse_other_way, scenario_jobs
+from scenarios.live.recorder import Recorder
 from scenarios.live.requests import read_jobs
 from scenarios.prepare.fleet import make_env, prepare, prepare_arm
 from scenarios.spec.load import load
@@ -382,6 +383,14 @@ def test_up_refuses_a_webhook_that_cannot_be_sent_before_it_plans(thermofleet, t
     assert says in " ".join(err.split())
 
 
+def test_up_refuses_the_folder_of_another_fleet(thermofleet, tmp_path):
+    Recorder.open(tmp_path / "recording", "night").write()
+    code, _, err = thermofleet("up", "quickstart", "--out", tmp_path)
+    assert code == 2
+    assert "is of fleet 'night', not of 'quickstart': give another --out" in " ".join(err.split())
+    assert [each.name for each in tmp_path.iterdir()] == ["recording"]
+
+
 def test_up_refuses_a_port_in_use_before_it_plans(thermofleet, tmp_path):
     with socket.socket() as held:
         held.bind(("127.0.0.1", 0))
@@ -582,6 +591,13 @@ def test_a_list_of_jobs_has_a_line_for_each_and_ages_since_their_acceptance(endp
     assert " ".join(planned.split()) == f"planned waiting 0 of 12 10 min {why}"
     assert [line.split()[:2] for line in narrow] == [["new", "waiting"], ["planned", "waiting"]]
     assert all(len(line) <= 80 and "It waits until the_arm" in line for line in narrow)
+
+
+def test_a_list_of_jobs_needs_somebody_who_tells(endpoint, thermofleet):
+    with served(endpoint, lambda bus: bus.declare_token(keys.of_arm("f", "arm_0", "alive"))):
+        code, out, err = thermofleet("job", "list", "--endpoint", endpoint, "--fleet", "f")
+    assert (code, out) == (2, "")
+    assert "Nobody tells of jobs" in err
 
 
 def test_ask_shows_the_cost_of_a_job_for_each_arm(endpoint, thermofleet):

@@ -255,6 +255,12 @@ class ClockSync:
         self._link, self._clock, self._set_clock, self._warn = link, clock, set_clock, warn
         self._asked_s, self._is_set = -math.inf, False
 
+    def ask_first(self, real_s: float) -> None:
+        """Request the fleet time now, unless it is known: an award may follow, whose event has a time."""
+        if not self._is_set:
+            self._asked_s = -math.inf
+            self.step(real_s)
+
     def step(self, real_s: float) -> None:
         """Request the fleet time, when that is due."""
         if real_s < self._asked_s + CLOCK_S[self._is_set]:
@@ -306,6 +312,10 @@ class WorkSource(Protocol):
 
     def step(self, real_s: float) -> None:
         """Do what is due."""
+        ...
+
+    def quotes(self, real_s: float) -> None:
+        """Prepare for an award, as the arm is about to quote."""
         ...
 
 
@@ -367,6 +377,10 @@ class AuctioneerClient:
     def step(self, real_s: float) -> None:
         """Request the fleet time, when that is due."""
         self._clock.step(real_s)
+
+    def quotes(self, real_s: float) -> None:
+        """Request the fleet time before the first quote."""
+        self._clock.ask_first(real_s)
 
     def _send(
         self,
@@ -476,6 +490,7 @@ class ArmNode:
         jobs = {job.name: job for job in request.jobs}
         if len(jobs) != len(request.jobs):
             raise Refused("The request names a job twice.")
+        self.work_source.quotes(time.monotonic())
         estimates, name = self.estimate(request.jobs, request.cycles, dry_run=request.dry_run), ""
         real_s = self._quoted_s = time.monotonic()
         if not request.dry_run:

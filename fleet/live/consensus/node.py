@@ -132,6 +132,9 @@ class ConsensusNode(JobDesk):
         finally:
             self._busy = False
 
+    def quotes(self, real_s: float) -> None:
+        """Do nothing: an arm that allocates jobs with its peers accepts no award."""
+
     @property
     def over(self) -> bool:
         """Whether nothing is left to do: all is settled and every present arm knows, or the shift has ended."""

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 from shlex import quote
 from statistics import median
 from typing import Literal
@@ -247,7 +248,9 @@ def check_arm(arm: ArmSnapshot, offset_s: float | None) -> list[Finding]:
         hot = f"{arm.arm} is faulted: joint {arm.joint} is at {arm.hottest_c:.1f} °C."
         findings.append(Finding("warning", hot, "fault", arm.arm))
     if arm.break_end_s is not None:
-        findings.append(Finding("note", f"{arm.arm} is in a break until {arm.break_end_s:.0f} s of fleet time."))
+        findings.append(
+            Finding("note", f"{arm.arm} is in a break until {timedelta(seconds=round(arm.break_end_s))} of fleet time.")
+        )
     if arm.bad_sensor:
         wrong = f"{arm.arm} has impossible temperatures: {arm.bad_sensor}."
         findings.append(Finding("warning", wrong, "sensor", arm.arm))

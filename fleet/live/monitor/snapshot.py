@@ -11,6 +11,7 @@ import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import timedelta
 from functools import partial
 from itertools import repeat
 from typing import Literal, TypeVar
@@ -427,7 +428,7 @@ def why_idle(arm: ArmSnapshot, waiting: Mapping[str, str], paused: Mapping[str, 
     if arm.mode == "faulted":
         return "It is faulted."
     if arm.break_end_s is not None:
-        return f"It is in a break until {arm.break_end_s:.0f} s."
+        return f"It is in a break until {timedelta(seconds=round(arm.break_end_s))} of fleet time."
     if arm.headroom_k is not None and arm.headroom_k <= 0.0:
         return "It is above its warning limit."
     if not waiting:

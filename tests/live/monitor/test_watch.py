@@ -1,6 +1,7 @@
 """The `watch` screen and command."""
 
 import json
+import os
 import re
 import signal
 import subprocess
@@ -111,7 +112,8 @@ def test_ages_and_times_are_short():
 @pytest.mark.ci_slow
 def test_without_a_terminal_tables_are_printed_until_stopped(fleet):
     for number, code in ((signal.SIGTERM, 0), (signal.SIGINT, 130)):
-        process = commands.start("bus", "watch", "--endpoint", fleet.endpoint, stderr=subprocess.DEVNULL)
+        env = {name: value for name, value in os.environ.items() if name != "COLUMNS"}  # as wide as it needs
+        process = commands.start("bus", "watch", "--endpoint", fleet.endpoint, stderr=subprocess.DEVNULL, env=env)
         try:
             assert process.stdout.readline() == "a joined\n"
             fleet.say()
