@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property
-from itertools import zip_longest
+from itertools import pairwise, zip_longest
 from math import inf, isfinite
 from typing import Any, Literal  # Any: values of a card
 
@@ -212,7 +212,7 @@ def _breaks(arm: str, log: Sequence[Event], work: Sequence[JobSpan], horizon_s: 
     if ends and (not begins or ends[0] < begins[0][0]):
         begins.insert(0, (0.0, ends[0]))
     out: list[Outage] = []
-    for (begin_s, planned_s), following_s in zip(begins, [*(each for each, _ in begins[1:]), inf], strict=True):
+    for (begin_s, planned_s), (following_s, _) in pairwise([*begins, (inf, inf)]):
         planned_s = planned_s if isfinite(planned_s) else horizon_s
         # Breaks that adjoin or overlap have one begin and one end.
         end_s = min((each for each in ends if begin_s < each <= following_s), default=max(begin_s, planned_s))

@@ -384,7 +384,8 @@ def test_up_refuses_a_webhook_that_cannot_be_sent_before_it_plans(thermofleet, t
 
 
 def test_up_refuses_the_folder_of_another_fleet(thermofleet, tmp_path):
-    Recorder.open(tmp_path / "recording", "night").write()
+    (tmp_path / "recording").mkdir()
+    Recorder.open(tmp_path / "recording", "night")
     code, _, err = thermofleet("up", "quickstart", "--out", tmp_path)
     assert code == 2
     assert "is of fleet 'night', not of 'quickstart': give another --out" in " ".join(err.split())
