@@ -16,7 +16,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Clock, ClockRequest, JobStatus
 from fleet.bus.protocol.messages import State
 from fleet.bus.router import Router
-from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_health
+from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_fleet, check_health
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, AuctioneerSnapshot, FleetSnapshot
 from scenarios.show.watch import space_line
 from tests import commands
@@ -50,6 +50,24 @@ def test_an_absent_arm_that_keeps_its_space_is_a_warning():
 def faults(now, *probes, **more):
     found = check_health(now, 101.505, probes or [ASKED], **more)
     return [finding.what for finding in found.findings if finding.level == "fault"], found
+
+
+@pytest.mark.parametrize(
+    ("ages_s", "present", "silent"),
+    [
+        ({"au": 15.1}, True, "au"),
+        ({"au": 14.9}, True, ""),
+        ({"au": None}, True, ""),
+        ({"arm_0": 90.0, "arm_1": 20.0}, True, "arm_1"),
+        ({"arm_0": 90.0, "arm_1": 2.0}, True, ""),
+        ({"au": 60.0}, False, ""),
+    ],
+    ids=["hung", "in time", "never heard", "no arm replies", "another arm replies", "all have left"],
+)
+def test_a_fleet_in_which_nobody_replies_about_jobs_raises_an_alarm(ages_s, present, silent):
+    auctioneers = tuple(AuctioneerSnapshot(name, True, age_s) for name, age_s in ages_s.items())
+    findings = check_fleet(fleet(arm(present=present), auctioneers=auctioneers), None)
+    assert [each.subject for each in findings if each.kind == "silent"] == [silent] * bool(silent)
 
 
 WAY = "It waits until gone one is out of the way."

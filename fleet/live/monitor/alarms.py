@@ -14,6 +14,7 @@ from fleet.live.monitor.snapshot import MAX_ALARMS
 
 LASTING = {
     "absent": "{} is absent: it has left, or its process hangs or has ended.",
+    "silent": "{} does not reply: its process hangs or has ended, and no job is awarded.",
     "space": "The space of {} stays closed to other arms, as it is not present.",
 }
 """Texts of alarms whose findings name a state of the moment, by kind."""

@@ -223,6 +223,7 @@ class AsyncBridge:
         findings = check_fleet(now, self._earlier[0] if len(self._earlier) == self._earlier.maxlen else None)
         self._earlier.append(now)
         heard = {each.arm for each in now.arms} | {each.job for each in now.jobs}
+        heard |= {each.auctioneer for each in now.auctioneers}
         for alarm in self._alarms.update(findings, self._time_s(), real_s, heard):
             self._change(alarm)
 

@@ -11,7 +11,7 @@ from typing import Literal
 import msgspec
 
 from fleet.live.clock import FleetClock
-from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetSnapshot
+from fleet.live.monitor.snapshot import FRESH_S, STATUS_EVERY_S, ArmSnapshot, FleetSnapshot
 
 REASONS = {
     "It is released at": "release", "It waits for": "predecessor", "are paused": "paused", "paused by": "paused",
@@ -25,6 +25,8 @@ EXPECTED = ("release", "predecessor", "paused", "queue", "break", "planning", "h
 """Classes of jobs that wait in order."""
 MOST_REASONS = 5
 NO_OFFSETS: Mapping[str, float] = {}
+SILENT_S = 3 * STATUS_EVERY_S
+"""Real seconds without a reply about the jobs, after which nobody allocates them."""
 OFFSET_S, SLOW_S = 1.0, 0.1
 """Real seconds: clock offsets and round trips above these are findings."""
 
@@ -140,7 +142,17 @@ def check_fleet(
         offsets_s: As in a report.
     """
     arms = (finding for arm in fleet.arms for finding in check_arm(arm, offsets_s.get(arm.arm)))
-    return [*arms, *check_jobs(fleet), *check_progress(fleet, earlier), *check_space(fleet)]
+    return [*arms, *check_replies(fleet), *check_jobs(fleet), *check_progress(fleet, earlier), *check_space(fleet)]
+
+
+def check_replies(fleet: FleetSnapshot) -> list[Finding]:
+    """Check that somebody still replies about the jobs while arms are present: an auctioneer, or an arm without one."""
+    ages_s = {each.auctioneer: each.heard_age_s for each in fleet.auctioneers if each.heard_age_s is not None}
+    last = min(ages_s, key=lambda name: ages_s[name], default="")
+    if not last or ages_s[last] <= SILENT_S or not any(arm.present for arm in fleet.arms):
+        return []
+    silent = f"{last} has not replied for {ages_s[last]:.0f} s: its process hangs or has ended, and no job is awarded."
+    return [Finding("fault", silent, "silent", last)]
 
 
 def check_jobs(fleet: FleetSnapshot) -> list[Finding]:
