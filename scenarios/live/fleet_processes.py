@@ -4,9 +4,12 @@ import os
 import socket
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+
+import msgspec
 
 from agents.policy import no_simulator
 from fleet.bus.security.tls import Tls
@@ -187,13 +190,12 @@ def _refuse_other_fleet(folder: Path, fleet: str) -> None:
     """Refuse the folder of another fleet, whose jobs would be continued with the arms and places of this one.
 
     Raises:
-        FleetError: its recording is of another fleet, or damaged.
+        FleetError: its recording is of another fleet.
     """
-    from scenarios.live.recording import CARD, read_card
-
-    recording = folder / "recording"
-    if (recording / CARD).exists() and (other := read_card(recording).fleet) != fleet:
-        raise FleetError(f"'{folder}' is of fleet '{other}', not of '{fleet}': give another --out.")
+    card = folder / "recording" / "recording.json"  # read without Arrow, whose threads no fork can share
+    with suppress(OSError, msgspec.DecodeError, KeyError):  # what is damaged, the recorder says
+        if (other := msgspec.json.decode(card.read_bytes(), type=dict)["fleet"]) != fleet:
+            raise FleetError(f"'{folder}' is of fleet '{other}', not of '{fleet}': give another --out.")
 
 
 def page_of(

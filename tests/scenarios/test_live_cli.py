@@ -392,6 +392,28 @@ def test_up_refuses_the_folder_of_another_fleet(thermofleet, tmp_path):
     assert [each.name for each in tmp_path.iterdir()] == ["recording"]
 
 
+def test_up_forks_its_parts_after_what_it_checks_and_imports(tmp_path):
+    """A fork shares no thread: nothing before may start one, as Arrow does."""
+    program = f"""
+import os
+from importlib import import_module
+from pathlib import Path
+import scenarios.cli.main
+from fleet.live.supervisor import _may_fork
+from scenarios.live import fleet_processes as up
+os.environ["THERMOFLEET_WEBHOOK_SECRET"] = 16 * "x"
+up._check_page(None, ["http://127.0.0.1:9/"])
+up._refuse_other_fleet(Path({str(tmp_path)!r}), "quickstart")
+for module in (*up.SHARED, *up.SHARED_BY_PAGE):
+    import_module(module)
+print(_may_fork())
+"""
+    (tmp_path / "recording").mkdir()
+    Recorder.open(tmp_path / "recording", "quickstart")
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=False)
+    assert done.stdout == "True\n", done.stderr
+
+
 def test_up_refuses_a_port_in_use_before_it_plans(thermofleet, tmp_path):
     with socket.socket() as held:
         held.bind(("127.0.0.1", 0))
