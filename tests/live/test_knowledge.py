@@ -230,6 +230,8 @@ class Leases:
     def step(self, real_s: float) -> None:
         pass
 
+    quotes = step
+
 
 def arms_of(small, works):
     """Arms without sensor noise, each with a fast plan and one of less torque per work; the last one is weak."""

@@ -253,11 +253,11 @@ class ClockSync:
         warn: Callable[[str, str], None],
     ) -> None:
         self._link, self._clock, self._set_clock, self._warn = link, clock, set_clock, warn
-        self._asked_s, self._is_set = -math.inf, False
+        self._asked_s, self._is_set, self._asking = -math.inf, False, False
 
     def ask_first(self, real_s: float) -> None:
         """Request the fleet time now, unless it is known: an award may follow, whose event has a time."""
-        if not self._is_set:
+        if not (self._is_set or self._asking):
             self._asked_s = -math.inf
             self.step(real_s)
 
@@ -265,9 +265,10 @@ class ClockSync:
         """Request the fleet time, when that is due."""
         if real_s < self._asked_s + CLOCK_S[self._is_set]:
             return
-        self._asked_s = real_s
+        self._asked_s, self._asking = real_s, True
 
         def done(answers: Replies[Clock]) -> None:
+            self._asking = False
             for reply in answers.messages.values():
                 self._apply(reply, real_s, time.monotonic())
                 return
@@ -275,6 +276,7 @@ class ClockSync:
         try:
             self._link.query(keys.of_clock(self._link.fleet), ClockRequest(), Clock, done, timeout_s=REPLY_S)
         except BusError as error:
+            self._asking = False
             self._warn("bus", str(error))
 
     def _apply(self, reply: Clock, asked_s: float, answered_s: float) -> None:
