@@ -2,8 +2,8 @@
 
 import re
 import signal
-import time
 import subprocess
+import time
 from contextlib import ExitStack
 
 import pytest
