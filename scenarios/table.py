@@ -259,7 +259,7 @@ class Table:
 
 
 def _with_shorter(row: list[str], column: int, most: int) -> tuple[str, ...]:
-    """A row with at most so many characters in one column."""
+    """A row with at most `most` characters in one column."""
     from rich.cells import cell_len, set_cell_size
 
     if cell_len(row[column]) > most:

@@ -222,7 +222,7 @@ class Fault:
 
 
 class JournalFiles:
-    """What the journals of arms have told since the start, also if a compaction has left it out since."""
+    """Finished jobs by the journals of arms since the start, including records that a compaction has removed."""
 
     EVERY_S = 0.2
     """Real seconds between two readings of a journal, which is compacted less often."""

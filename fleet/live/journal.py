@@ -245,7 +245,7 @@ class Journal(Generic[Record]):
         """
         ((_, taken, _),) = db.execute("PRAGMA wal_checkpoint(NOOP)")
         left_out = sum(number > int(taken) for number in commits)
-        if left_out > 1:  # a crash leaves one, which nobody has been told of
+        if left_out > 1:  # a crash leaves one, which was not acknowledged
             raise JournalError(f"'{self.path}-wal' is damaged: {left_out} steps at its end cannot be read. {_REMEDY}")
         if left_out:
             _LOG.warning("%s: left out the last step of its log, which was not complete.", self.path)

@@ -211,10 +211,6 @@ def _vae(planned: PlannedFleet, training: int, *, trained: bool = True, thermome
     return planned.scored(planned.learned(training, "excess", trained=trained, thermometers=thermometers))
 
 
-def _unweighted(planned: PlannedFleet, fleet: Fleet) -> Fleet:
-    return planned.scored([_Unweighted(arm.model) for arm in fleet.arms])
-
-
 def _torque(planned: PlannedFleet, *, thermometers: bool = True) -> Fleet:
     from scenarios.prepare.twins import exploration_records, records, require_cool_plans
     from twin.baselines import known_torque

@@ -527,7 +527,7 @@ def content_type(request: Request) -> str:
 
 
 async def read_bytes(request: Request, most: int) -> bytes:
-    """Read a body of at most so many bytes; raises an HTTPException if it is too large or too slow."""
+    """Read a body of at most `most` bytes; raises an HTTPException if it is too large or too slow."""
     content = bytearray()
     try:
         async with asyncio.timeout(BODY_S):

@@ -230,7 +230,7 @@ class Leases:
     def step(self, real_s: float) -> None:
         pass
 
-    quotes = step
+    prepare_quote = step
 
 
 def arms_of(small, works):

@@ -76,6 +76,7 @@ def test_a_killed_process_is_restarted_while_its_child_holds_the_output_open(tmp
         try:
             os.kill(first, signal.SIGKILL)
             supervisor.run(until(lambda: supervisor.restarts()["a"] == 1), poll_s=0.05)
+            assert supervisor.pid("a") not in (None, first)
         finally:
             os.killpg(first, signal.SIGKILL)
             os.killpg(supervisor.pid("a"), signal.SIGKILL)

@@ -258,13 +258,14 @@ class ClockSync:
     def ask_first(self, real_s: float) -> None:
         """Request the fleet time now, unless it is known: an award may follow, whose event has a time."""
         if not (self._is_set or self._asking):
-            self._asked_s = -math.inf
-            self.step(real_s)
+            self._ask(real_s)
 
     def step(self, real_s: float) -> None:
         """Request the fleet time, when that is due."""
-        if real_s < self._asked_s + CLOCK_S[self._is_set]:
-            return
+        if real_s >= self._asked_s + CLOCK_S[self._is_set]:
+            self._ask(real_s)
+
+    def _ask(self, real_s: float) -> None:
         self._asked_s, self._asking = real_s, True
 
         def done(answers: Replies[Clock]) -> None:
@@ -316,7 +317,7 @@ class WorkSource(Protocol):
         """Do what is due."""
         ...
 
-    def quotes(self, real_s: float) -> None:
+    def prepare_quote(self, real_s: float) -> None:
         """Prepare for an award, as the arm is about to quote."""
         ...
 
@@ -380,7 +381,7 @@ class AuctioneerClient:
         """Request the fleet time, when that is due."""
         self._clock.step(real_s)
 
-    def quotes(self, real_s: float) -> None:
+    def prepare_quote(self, real_s: float) -> None:
         """Request the fleet time before the first quote."""
         self._clock.ask_first(real_s)
 
@@ -492,7 +493,7 @@ class ArmNode:
         jobs = {job.name: job for job in request.jobs}
         if len(jobs) != len(request.jobs):
             raise Refused("The request names a job twice.")
-        self.work_source.quotes(time.monotonic())
+        self.work_source.prepare_quote(time.monotonic())
         estimates, name = self.estimate(request.jobs, request.cycles, dry_run=request.dry_run), ""
         real_s = self._quoted_s = time.monotonic()
         if not request.dry_run:

@@ -132,7 +132,7 @@ class ConsensusNode(JobDesk):
         finally:
             self._busy = False
 
-    def quotes(self, real_s: float) -> None:
+    def prepare_quote(self, real_s: float) -> None:
         """Do nothing: an arm that allocates jobs with its peers accepts no award."""
 
     @property
