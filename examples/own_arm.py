@@ -68,11 +68,15 @@ class Arm:
             alive.undeclare()
 
     def leave(self):
-        """Return the job, and reply to one quote after the receipt: then our space is free, and nobody misses us."""
+        """Return the job, reply to one quote after the receipt, and refuse awards until our last quote has lapsed.
+
+        Then our space is free, no award is without an answer, and nobody misses us.
+        """
         self.leaving = True
         if self.job:
             self.report("returned")
-        self.serve(LEAVE_S, lambda: not (self.reports or self.closed))
+        lapsed_s = max(self.quotes.values(), default=0.0) + VALID_S  # later quotes are without capacity
+        self.serve(LEAVE_S, lambda: not (self.reports or self.closed) and time.monotonic() > lapsed_s)
 
     def serve(self, seconds, is_done):
         """Reply, work and publish for this time, or until it is done."""

@@ -64,7 +64,7 @@ def test_own_arm_and_the_submitter_work_with_the_real_auctioneer(bus, tmp_path):
             assert one.returncode == 0, one.stderr
             serve_until(lambda: any(status.arm and status.job == "hold" for status in statuses), watcher)
             holder = next(status.arm for status in statuses if status.arm and status.job == "hold")
-            for arm in (second, first) if holder == "a" else (first, second):  # or the other might get it meanwhile
+            for arm in (first, second) if holder == "a" else (second, first):  # the other may get it meanwhile
                 arm.send_signal(signal.SIGINT)
                 assert arm.wait(PATIENCE_S) == 130
             asked = keys.of_jobs("f", "status"), StatusRequest(), Status
