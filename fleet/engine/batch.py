@@ -544,4 +544,6 @@ def _no_terms(envs: int) -> Array:
 
 
 def _widen(after: Array, waits: int) -> Array:
-    return np.pad(after, ((0, 0), (0, waits - after.shape[1])), constant_values=-1)
+    wide = np.full((len(after), waits), -1)
+    wide[:, : after.shape[1]] = after
+    return wide

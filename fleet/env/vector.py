@@ -342,13 +342,15 @@ class BatchEnv:
             return
         seeds = [self._seeds[e] if self._fresh[e] else self._seeds[e].spawn(1)[0] for e in rows.tolist()]
         self._fresh[rows] = False
-        self.begin(rows, [self._library.draw(seed) for seed in seeds], [shift_seeds(seed)[1] for seed in seeds])
+        sensors = [] if self._exchanges is None else [shift_seeds(seed)[1] for seed in seeds]
+        self.begin(rows, [self._library.draw(seed) for seed in seeds], sensors)
 
     def begin(self, rows: Array, shifts: Sequence[Shift], sensors: Sequence[np.random.SeedSequence]) -> None:
         """Begin given shifts in some envs, with their observations in `parts`.
 
         Args:
-            sensors: Seed of the sensors of each shift, from which delays and losses of messages follow.
+            sensors: Seed of the sensors of each shift, from which delays and losses of messages follow; not read without
+                exchanges.
         """
         self.engine.reset(rows, shifts)
         self._begun, self._over[rows], self._tick[rows] = True, False, 0

@@ -49,7 +49,7 @@ class Randomisation:
 
     def __bool__(self) -> bool:
         """Whether anything is randomised."""
-        return self != Randomisation()
+        return self != _NOTHING
 
     def __hash__(self) -> int:
         return hash((self.ambient_k, self.arrivals, repr(self.variants)))
@@ -57,7 +57,7 @@ class Randomisation:
     @property
     def text(self) -> str:
         """What is randomised, in words."""
-        default, parts = Randomisation(), list[str]()
+        default, parts = _NOTHING, list[str]()
         if self.ambient_k != default.ambient_k:
             parts.append("ambient temperature {:+g} to {:+g} K".format(*self.ambient_k))
         if self.arrivals != default.arrivals:
@@ -103,6 +103,9 @@ class Randomisation:
                 ) from error
 
 
+_NOTHING = Randomisation()
+
+
 def randomisation_of(given: object) -> Randomisation:
     """The randomisation that was given; None is one that changes nothing.
 
@@ -111,7 +114,7 @@ def randomisation_of(given: object) -> Randomisation:
     """
     if not isinstance(given, Randomisation | None):
         raise ScenarioError(f"randomise must be a scenarios.prepare.fleet.Randomisation (got {given!r}).")
-    return given or Randomisation()
+    return given or _NOTHING
 
 
 class ShiftConditions(NamedTuple):
