@@ -9,6 +9,7 @@
 Each name is imported when it is first used, so `import thermofleet` loads no simulator.
 """
 
+import sys
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -80,3 +81,8 @@ def _check_packages() -> None:
                 f"Python finds '{origin or package}' instead of thermofleet's package '{package}': rename your file or "
                 "folder, or start Python in another folder."
             )
+
+
+if "pettingzoo" in sys.modules:  # `pettingzoo.make` then knows the environment
+    _check_packages()
+    import_module("scenarios")

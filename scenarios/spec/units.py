@@ -15,6 +15,8 @@ MOST = 1e15
 """Smallest number that is not looked at: it is refused for its size."""
 FEW = 3
 """Times of which it cannot be said that they are minutes."""
+MOST_NAMED = 3
+"""Times that a warning names."""
 
 
 class _Mistake(NamedTuple):
@@ -92,11 +94,12 @@ def _is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < MOST
 
 
-def check_times(times_s: Sequence[float], horizon_s: float, where: str) -> None:
+def check_times(times_s: Sequence[float], horizon_s: float, where: str, names: Sequence[str] = ()) -> None:
     """Log a warning if some arrival times lie outside the shift, or are probably in another unit.
 
     Args:
         where: Begins each sentence.
+        names: Of the times, for the warning; may be left out.
 
     Raises:
         ScenarioError: none lies in the shift.
@@ -115,11 +118,17 @@ def check_times(times_s: Sequence[float], horizon_s: float, where: str) -> None:
         )
     if inside < count:
         _LOG.warning(
-            "%s: %d of %d times are outside the shift, which ends at horizon_s = %g; these jobs never arrive.%s",
-            *(where, count - inside, count, horizon_s, question),
+            "%s: %d of %d times are outside the shift, which ends at horizon_s = %g; these jobs never arrive%s.%s",
+            *(where, count - inside, count, horizon_s, _first_outside(times_s, horizon_s, names), question),
         )
     elif question:
         _LOG.warning("%s: all %d times are within %g s of a shift of %g s.%s", where, count, last, horizon_s, question)
+
+
+def _first_outside(times_s: Sequence[float], horizon_s: float, names: Sequence[str]) -> str:
+    """The first of the named times outside the shift, after a colon; "" without names."""
+    outside = [f"{name} at {time:.15g} s" for name, time in zip(names, times_s, strict=False) if time >= horizon_s]
+    return f": {', '.join(outside[:MOST_NAMED])}{', …' * (len(outside) > MOST_NAMED)}" if outside else ""
 
 
 def _unit_of_times(times_s: Sequence[float], horizon_s: float) -> str:
@@ -129,7 +138,8 @@ def _unit_of_times(times_s: Sequence[float], horizon_s: float) -> str:
         if first * factor < 1e10:
             day = datetime.fromtimestamp(first * factor, UTC).isoformat(sep=" ", timespec="seconds")
             return f" Are these {unit} since 1970? The first is {day[:19]} UTC. Subtract the begin of the shift."
-    if last >= horizon_s and last / 1000 < horizon_s and last >= 10 * horizon_s:
+    middle = sorted(times_s)[len(times_s) // 2]  # a single date beyond the shift is no unit
+    if middle >= horizon_s and last / 1000 < horizon_s and last >= 10 * horizon_s:
         return f" Are these milliseconds? {last:g} ms is {last / 1000:g} s. Give seconds."
     if len(times_s) >= FEW and horizon_s / 2 <= 60 * last <= horizon_s:
         return f" Are these minutes? {last:g} min is {60 * last:g} s. Give seconds."

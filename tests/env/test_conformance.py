@@ -295,6 +295,7 @@ def test_make_batch_takes_a_scenario(cell, plans) -> None:
     "first",
     [
         "import pettingzoo, scenarios",
+        "import pettingzoo, thermofleet",
         "import scenarios, pettingzoo; scenarios.make_env",
         "import scenarios.prepare.env_registration",
     ],
