@@ -138,6 +138,17 @@ def test_a_new_epoch_in_the_same_folder_is_no_repetition(tmp_path):
     assert read_parts(tmp_path, "gaps").num_rows == 0
 
 
+def test_a_repeated_event_of_a_later_time_is_no_restart(tmp_path):
+    """An arm numbers its arrival at home before the finish, which was earlier; a cache repeats both."""
+    recorder = Recorder.open(tmp_path, "f")
+    sent = [replace(event("a", number), time_s=time_s) for number, time_s in ((1, 10.0), (2, 30.0), (3, 20.0))]
+    for message in (*sent, *sent):
+        recorder.add("a", message)
+    recorder.write(status="finished")
+    assert read_parts(tmp_path, "events")["number"].to_pylist() == [1, 3, 2]
+    assert read_parts(tmp_path, "gaps").num_rows == 0
+
+
 def test_a_result_of_an_earlier_time_is_no_restart(tmp_path):
     """An auctioneer numbers a late report after results of later times, and repeats all after a restart."""
     recorder = Recorder.open(tmp_path, "f")
