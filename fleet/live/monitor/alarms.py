@@ -43,7 +43,12 @@ class AlarmList:
                 self._lasting[alarm.kind, alarm.subject] = alarm.alarm, math.inf
 
     def update(
-        self, findings: Sequence[Finding], time_s: float, real_s: float, heard: Container[str] | None = None
+        self,
+        findings: Sequence[Finding],
+        time_s: float,
+        real_s: float,
+        heard: Container[str] | None = None,
+        speed: float = 1.0,
     ) -> list[Alarm]:
         """Begin and end alarms by the present findings; return those that have changed.
 
@@ -52,6 +57,7 @@ class AlarmList:
                 for example that of an arm which fell silent before the monitor began. None: it knows of all.
             time_s: Fleet time.
             real_s: Real seconds of a monotonic clock.
+            speed: Fleet seconds per real second.
         """
         changed: list[Alarm] = []
         for finding in findings:
@@ -62,7 +68,8 @@ class AlarmList:
             if not name and len(self._lasting) < MAX_ALARMS // 2:
                 name = secrets.token_hex(4)
                 what = LASTING.get(finding.kind, finding.what).format(finding.subject)
-                alarm = Alarm(self.monitor, 0, time_s, name, finding.kind, what, finding.subject, time_s)
+                began_s = max(0.0, time_s - speed * finding.since_s)
+                alarm = Alarm(self.monitor, 0, time_s, name, finding.kind, what, finding.subject, began_s)
                 changed.append(self._change(alarm, time_s))
             if name:
                 self._lasting[key] = name, real_s

@@ -224,7 +224,7 @@ class AsyncBridge:
         self._earlier.append(now)
         heard = {each.arm for each in now.arms} | {each.job for each in now.jobs}
         heard |= {each.auctioneer for each in now.auctioneers}
-        for alarm in self._alarms.update(findings, self._time_s(), real_s, heard):
+        for alarm in self._alarms.update(findings, self._time_s(), real_s, heard, now.speed or 1.0):
             self._change(alarm)
 
     def _change(self, alarm: Alarm) -> None:

@@ -41,6 +41,8 @@ class Finding(msgspec.Struct, frozen=True):
     """Kind of the alarm that it raises; "" for none."""
     subject: str = ""
     """Arm or job of the alarm; "" for the fleet. An alarm lasts while there is a finding of its kind and subject."""
+    since_s: float = 0.0
+    """Real seconds for which it has been so before it was found."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,7 @@ def check_replies(fleet: FleetSnapshot) -> list[Finding]:
     if not last or ages_s[last] <= SILENT_S or not any(arm.present for arm in fleet.arms):
         return []
     silent = f"{last} has not replied for {ages_s[last]:.0f} s: its process hangs or has ended, and no job is awarded."
-    return [Finding("fault", silent, "silent", last)]
+    return [Finding("fault", silent, "silent", last, ages_s[last])]
 
 
 def check_jobs(fleet: FleetSnapshot) -> list[Finding]:

@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.bus.protocol.auction import JobStatus
+from fleet.bus.protocol.auction import JobStatus, Status
 from fleet.bus.protocol.operator import Alarm
 from fleet.errors import Refused
 from fleet.live.monitor.alarms import HOLD_S, AlarmList
-from fleet.live.monitor.health import Finding, check_jobs
+from fleet.live.monitor.health import Finding, check_jobs, check_replies
 from fleet.live.monitor.snapshot import MAX_ALARMS, FleetSnapshot, FleetView
 from tests.live.monitor.messages import state
 
@@ -84,8 +84,6 @@ def test_findings_without_a_kind_raise_no_alarm():
     ],
 )
 def test_an_arm_without_a_job_says_why(change, waiting, paused, says):
-    from fleet.bus.protocol.auction import JobStatus, Status
-
     view = FleetView("f")
     view.set_token("arm", "a", True)
     view.update("a", state(**change), 0.0)
@@ -119,6 +117,18 @@ def test_an_alarm_of_an_unheard_arm_lasts_until_somebody_has_seen_it():
     alarms.acknowledge("a1", "ada", 41.0, NOON)
     ended = [each for second in range(20, 40) for each in alarms.update([], 60.0, float(second), heard={"arm_1"})]
     assert [each.ended_s for each in ended] == [60.0]
+
+
+def test_the_alarm_of_a_silence_begins_with_the_last_reply():
+    """By hand: 20 s without a reply, at 60 fleet seconds a second, before fleet time 2000 s."""
+    view = FleetView("f")
+    view.set_token("arm", "a", True)
+    view.set_token("auction", "au", True)
+    view.update_jobs(Status("au", 800.0, ()), 0.0)
+    view.update("a", state(time_s=2000.0), 20.0)
+    findings = check_replies(view.snapshot(20.0))
+    (alarm,) = AlarmList("m").update(findings, 2000.0, 20.0, speed=60.0)
+    assert (alarm.kind, alarm.subject, alarm.time_s, alarm.began_s) == ("silent", "au", 2000.0, 800.0)
 
 
 def test_the_end_of_the_shift_raises_no_alarm_and_the_text_of_an_absence_stays_true():
