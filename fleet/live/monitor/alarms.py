@@ -81,7 +81,8 @@ class AlarmList:
             self._lasting[key] = name, seen_s
             if real_s - seen_s > HOLD_S:
                 del self._lasting[key]
-                changed.append(self._change(replace(self.alarms[name], ended_s=time_s), time_s))
+                ended_s = max(self.alarms[name].began_s, time_s - speed * (real_s - seen_s))
+                changed.append(self._change(replace(self.alarms[name], ended_s=ended_s), time_s))
         return changed
 
     def acknowledge(self, name: str, by: str, time_s: float, now: datetime) -> Alarm:
