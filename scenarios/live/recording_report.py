@@ -256,20 +256,24 @@ def _returns(results: pa.Table, halts: Sequence[Halt]) -> list[Event]:
     it; the reason is the silence.
     """
     out: list[Event] = []
-    holder: dict[str, str] = {}
+    holder: dict[str, tuple[str, float]] = {}
+    """Arm of each job, and the time of its award."""
     for row in results.to_pylist():
         if row["shift_ended"]:
             continue
-        if row["state"] in _ENDED and (arm := holder.pop(row["job"], "")):
+        if row["state"] in _ENDED and row["job"] in holder:
+            arm, award_s = holder.pop(row["job"])
             reason = row["reason"] or "the arm returned the job, or lost its lease"
             if "did not renew its lease" in reason:
-                silent = (halt for halt in halts if not halt.arm and halt.start_s <= row["time_s"] <= halt.end_s)
+                silent = (
+                    halt for halt in halts if not halt.arm and award_s < halt.end_s and halt.start_s < row["time_s"]
+                )
                 reason = next((f"{halt.reason}, so its lease ended" for halt in silent), reason)
             out.append(
                 Event(time_s=row["time_s"], kind="return", arm=arm, job=row["job"], value=row["cycles"], reason=reason)
             )
         elif row["state"] == "awarded":
-            holder[row["job"]] = row["arm"]
+            holder[row["job"]] = row["arm"], row["time_s"]
         elif row["state"] == "finished":
             holder.pop(row["job"], None)
     return out
@@ -290,8 +294,8 @@ def telemetry_of(table: pa.Table, arms: Sequence[str]) -> Telemetry:
     mode = np.zeros(shape[:2], int)
     for a, arm in enumerate(arms):
         rows, times = np.flatnonzero(names == arm), own_s[a]
-        last = np.searchsorted(times, time_s, side="right") - 1
-        fresh = (last >= 0) & (time_s - times[last] <= ABSENT_SAMPLES * step_s)
+        last = np.maximum(np.searchsorted(times, time_s, side="right") - 1, 0)  # its first one also shortly before
+        fresh = np.abs(time_s - times[last]) <= ABSENT_SAMPLES * step_s
         mode[fresh, a] = modes[rows[last[fresh]]]
         for name, values in readings.items():
             out[name][fresh, a] = values[rows[last[fresh]]]

@@ -13,7 +13,7 @@ import numpy as np
 
 from fleet.env.render.heat import heat_scale
 from fleet.events import Event
-from scenarios.run.records import JobSpan, Notice, Offer, ShiftLog
+from scenarios.run.records import Halt, JobSpan, Notice, Offer, ShiftLog
 from scenarios.show.charts import AXIS, COLOURS, LAYOUT, Figure, named_rows, plain
 from scenarios.show.page import Badge, Chart, Head, Page, Playback, Section, packed
 from scenarios.show.timeline import STREAM_NAME, hottest_motors, shift_charts, stream_of, time_unit
@@ -70,6 +70,7 @@ def verdict(log: ShiftLog) -> Verdict:
         sentences.append(
             f"Arms touched something {f'{contacts} times' if contacts > 1 else 'once'}: see the events below."
         )
+    sentences += [f"{_halt(log, halt)}: no job was awarded." for halt in log.halts if not halt.arm]
     if late := late_jobs(log):
         sentences.append(lateness_text(log, late))
         moments[sentences[-1]] = Moment(late[0].due_s)
@@ -284,22 +285,24 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
     offers = [offer for offer in log.offers if offer.job == late.job]
     offers = offers or [offer for offer in log.offers if stream_of(offer.job) == stream_of(late.job)]
     able = [arm for arm in log.arms if any(offer.feasible and offer.arm == arm for offer in offers)]
-    alone = able[0] if len(able) == 1 else ""
-    for halt in (halt for halt in log.halts if halt.arm in ("", alone) and halt.start_s < late.due_s):
-        if min(halt.end_s, end_s) - max(halt.start_s, begin_s) >= (end_s - begin_s) / 2:
-            until = f"to {clock(halt.end_s, log.begin)}" if halt.end_s < log.plan.horizon_s else "to the end"
-            return f"{halt.reason} from {clock(halt.start_s, log.begin)} {until}"
     if not able:
         return "no arm got a job of its kind"
-    waits_s = _arm_time(log, able, begin_s, end_s)
+    halts = {_halt(log, halt): halt for halt in log.halts if halt.start_s < late.due_s}
+    waits_s = _arm_time(log, able, begin_s, end_s, halts)
     if all(each.start_s >= late.due_s for each in log.plan.breaks):
         waits_s.pop(PAUSED)  # it was late before
     most = max(waits_s, key=lambda why: waits_s[why])
     if not waits_s[most]:
         return f"what {names_text(able)} did meanwhile is not recorded"
     if most:
-        return f"{names_text(able)} {most}"
+        return most if most in halts else f"{names_text(able)} {most}"
     return _passed(log, late, able, begin_s, end_s)
+
+
+def _halt(log: ShiftLog, halt: Halt) -> str:
+    """What kept an arm, or all of them, from getting jobs, and when."""
+    until = f"to {clock(halt.end_s, log.begin)}" if halt.end_s < log.plan.horizon_s else "to the end"
+    return f"{halt.reason} from {clock(halt.start_s, log.begin)} {until}"
 
 
 def _return_reason(log: ShiftLog, span: JobSpan) -> str:
@@ -335,19 +338,23 @@ def _passed(log: ShiftLog, late: LateJob, able: Sequence[str], begin_s: float, e
     return f"{len(ahead)} other job{'s' * (len(ahead) > 1)} went first on {names_text(arms)}{which}"
 
 
-def _arm_time(log: ShiftLog, able: Sequence[str], begin_s: float, end_s: float) -> dict[str, float]:
-    """Time of the arms that can do a job between its release and its award, s, by what they did; "": later jobs."""
+def _arm_time(
+    log: ShiftLog, able: Sequence[str], begin_s: float, end_s: float, halts: Mapping[str, Halt]
+) -> dict[str, float]:
+    """Time of the arms that can do a job between its release and its award, s, by what they did, or by what kept them
+    from getting jobs; "": later jobs."""
     were = "were" if len(able) > 1 else "was"
     earlier, out = f"{were} at work since before its release", f"{were} out after a fault"
     failed, paused = f"{were} out after a failure", PAUSED
     hot, idle = f"{were} idle above the warning limit", f"{were} idle: its place was taken, or the policy let it wait"
-    time_s: dict[str, float] = dict.fromkeys(("", earlier, out, failed, paused, hot, idle), 0.0)
+    time_s: dict[str, float] = dict.fromkeys((*halts, "", earlier, out, failed, paused, hot, idle), 0.0)
     at_s = log.readings.time_s
     step_s = float(np.median(np.diff(at_s))) if len(at_s) > 1 else 0.0
     for arm in able:
         spans = [(s, earlier if s.start_s < begin_s else "") for s in log.plan.assignments if s.arm == arm]
         spans += [(each, out if each.kind == "fault" else failed) for each in log.plan.outages if each.arm == arm]
         spans += [(each, paused) for each in log.plan.breaks if each.arm == arm]
+        spans += [(halt, why) for why, halt in halts.items() if halt.arm in ("", arm)]
         free = (at_s >= begin_s) & (at_s < end_s)
         for span, why in spans:
             time_s[why] += max(0.0, min(span.end_s, end_s) - max(span.start_s, begin_s))

@@ -39,7 +39,7 @@ from scenarios.live.recorder import Recorder, lock_folder, record
 from scenarios.live.recording import CARD, alarms_of, open_messages, part_files, read_card, read_parts, replay
 from scenarios.live.recording_report import heat_use, open_recording, order_events
 from scenarios.run.records import JobRecord, ShiftLog, schedule
-from scenarios.show.run_page import late_jobs, lateness_text, report_html
+from scenarios.show.run_page import late_jobs, lateness_text, report_html, verdict
 from tests.profiles import examples
 from tests.waiting import PATIENCE_S, serve_until, wait_until
 
@@ -524,7 +524,7 @@ def test_a_job_that_waits_while_nobody_replies_is_late_by_that_and_not_by_its_ar
     assert record_wait(tmp_path / "2", 40.0, [replace(silent, ended_s=None)]) == (
         f"{waits}boss did not reply from 0:00:20 to the end."
     )
-    short = replace(silent, began_s=60.0)
+    short = replace(silent, began_s=45.0, ended_s=60.0)
     assert record_wait(tmp_path / "3", 40.0, [short]).startswith(f"{waits}arm_0 was idle")
     paused = [(15.0, Pause("arm_0")), (78.0, Resume())]
     assert record_wait(tmp_path / "4", 40.0, actions=paused) == (
@@ -540,9 +540,10 @@ def test_a_lease_that_ends_while_nobody_replies_is_not_blamed_on_the_arm(tmp_pat
     for number, (state, arm, reason) in enumerate(steps):
         status = JobStatus("a-1", state, arm=arm, reason=reason, due_s=30.0, release_s=0.0)
         recorder.add("boss", Result("boss", number, 70.0 * number, status))
-    recorder.add("m", Alarm("m", 1, 35.0, "7d1f", "silent", "boss does not reply.", "boss", began_s=20.0))
+    recorder.add("m", Alarm("m", 1, 35.0, "7d1f", "silent", "boss does not reply.", "boss", began_s=20.0, ended_s=65.0))
     recorder.write(status="finished")
     log = open_recording(tmp_path / "r")
+    assert "boss did not reply from 0:00:20 to 0:01:05: no job was awarded." in verdict(log).sentences
     why = "boss did not reply, so its lease ended"
     assert ["0:01:10", "job returned", "arm_0", "a-1", why] in listed_events(log.page())
     assert lateness_text(log, late_jobs(log)).endswith(f"arm_0 returned it at 0:01:10: {why}.")
