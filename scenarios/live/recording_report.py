@@ -75,8 +75,7 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
         raise FleetError(f"'{folder}' holds no state of an arm yet; record longer.")
     limits, model = _cell(scenario, card.cell, arms)
     alarms = alarms_of(folder) if len(epochs) < 2 else []  # they name no epoch
-    halts = tuple(_halts(alarms, operations))
-    ordered = order_events(arm_events(log), _returns(results, halts))
+    ordered = order_events(arm_events(log), _returns(results))
     events = tuple(event for event in ordered if event.arm in arms)
     telemetry = telemetry_of(table, arms)
     jobs = tuple(job_records(results))
@@ -103,7 +102,7 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
         events=events,
         jobs=jobs,
         notices=(*map(_request_notice, operations.to_pylist()), *_alarm_notices(alarms, arms, jobs)),
-        halts=halts,
+        halts=tuple(_halts(alarms, operations)),
         ended_s=min((row["time_s"] for row in results.to_pylist() if row["shift_ended"]), default=math.inf),
         offers=tuple(offer for row in results.to_pylist() for offer in offers_of(row)),
         model=model,
@@ -249,31 +248,20 @@ def job_records(results: pa.Table) -> Iterator[JobRecord]:
         )
 
 
-def _returns(results: pa.Table, halts: Sequence[Halt]) -> list[Event]:
-    """A `return` for each job that an arm had and has no more, though it did not finish it.
-
-    Of a lease that ended while nobody replied the auctioneer states, once it replies again, that the arm did not renew
-    it; the reason is the silence.
-    """
+def _returns(results: pa.Table) -> list[Event]:
+    """A `return` for each job that an arm had and has no more, though it did not finish it."""
     out: list[Event] = []
-    holder: dict[str, tuple[str, float]] = {}
-    """Arm of each job, and the time of its award."""
+    holder: dict[str, str] = {}
     for row in results.to_pylist():
         if row["shift_ended"]:
             continue
-        if row["state"] in _ENDED and row["job"] in holder:
-            arm, award_s = holder.pop(row["job"])
+        if row["state"] in _ENDED and (arm := holder.pop(row["job"], "")):
             reason = row["reason"] or "the arm returned the job, or lost its lease"
-            if "did not renew its lease" in reason:
-                silent = (
-                    halt for halt in halts if not halt.arm and award_s < halt.end_s and halt.start_s < row["time_s"]
-                )
-                reason = next((f"{halt.reason}, so its lease ended" for halt in silent), reason)
             out.append(
                 Event(time_s=row["time_s"], kind="return", arm=arm, job=row["job"], value=row["cycles"], reason=reason)
             )
         elif row["state"] == "awarded":
-            holder[row["job"]] = row["arm"], row["time_s"]
+            holder[row["job"]] = row["arm"]
         elif row["state"] == "finished":
             holder.pop(row["job"], None)
     return out
