@@ -13,7 +13,7 @@ import numpy as np
 
 from fleet.env.render.heat import heat_scale
 from fleet.events import Event
-from scenarios.run.records import Halt, JobSpan, Notice, Offer, ShiftLog
+from scenarios.run.records import Halt, JobSpan, Notice, Offer, Outage, ShiftLog
 from scenarios.show.charts import AXIS, COLOURS, LAYOUT, Figure, named_rows, plain
 from scenarios.show.page import Badge, Chart, Head, Page, Playback, Section, packed
 from scenarios.show.timeline import STREAM_NAME, hottest_motors, shift_charts, stream_of, time_unit
@@ -354,15 +354,21 @@ def _arm_time(
         spans = [(s, earlier if s.start_s < begin_s else "") for s in log.plan.assignments if s.arm == arm]
         spans += [(each, out if each.kind == "fault" else failed) for each in log.plan.outages if each.arm == arm]
         spans += [(each, paused) for each in log.plan.breaks if each.arm == arm]
-        spans += [(halt, why) for why, halt in halts.items() if halt.arm in ("", arm)]
+        kept = [(halt, why) for why, halt in halts.items() if halt.arm in ("", arm)]
         free = (at_s >= begin_s) & (at_s < end_s)
-        for span, why in spans:
-            time_s[why] += max(0.0, min(span.end_s, end_s) - max(span.start_s, begin_s))
+        for span, why in [*kept, *spans]:
+            halted_s = 0.0 if why in halts else sum(_common_s(begin_s, end_s, span, halt) for halt, _ in kept)
+            time_s[why] += _common_s(begin_s, end_s, span) - halted_s
             free &= (at_s < span.start_s) | (at_s >= span.end_s)
         peak_c = np.fmax.reduce(log.readings.temp_c[free, log.arms.index(arm)], axis=-1, initial=-math.inf)
         time_s[hot] += step_s * float((peak_c >= log.limits.warning_c).sum())
         time_s[idle] += step_s * float((peak_c < log.limits.warning_c).sum())
     return time_s
+
+
+def _common_s(begin_s: float, end_s: float, *spans: JobSpan | Outage | Halt) -> float:
+    """Time that some spans have in common between two times, s."""
+    return max(0.0, min(end_s, *(span.end_s for span in spans)) - max(begin_s, *(span.start_s for span in spans)))
 
 
 MOST_LATE = 50

@@ -500,11 +500,11 @@ def test_late_jobs_of_a_recording_and_of_a_run_are_counted_alike(tmp_path):
     assert (live.card["metrics"]["expired"], live.card["metrics"]["given_up"]) == (1, 0)
 
 
-def record_wait(folder, late_s, alarms=(), actions=()):
+def record_wait(folder, late_s, alarms=(), actions=(), before=()):
     """A recording of a job that is due at 50 s, waits for its only arm from 10 s to 80 s, and is finished at 90 s."""
     log = (Event(time_s=80.0, kind="award", arm="arm_0", job="a-1"),
            Event(time_s=90.0, kind="finish", arm="arm_0", job="a-1", value=late_s))  # fmt: skip
-    recorder = record_events(folder, log)
+    recorder = record_events(folder, (*before, *log))
     offer = structs.replace(EXAMPLES[Result].offers[0], arm="arm_0")
     award = JobStatus("a-1", "awarded", arm="arm_0", due_s=50.0, release_s=10.0)
     recorder.add("boss", Result("boss", 0, 80.0, award, offers=(offer,)))
@@ -524,6 +524,11 @@ def test_a_job_that_waits_while_nobody_replies_is_late_by_that_and_not_by_its_ar
     assert record_wait(tmp_path / "2", 40.0, [replace(silent, ended_s=None)]) == (
         f"{waits}boss did not reply from 0:00:20 to the end."
     )
+    busy = [
+        Event(time_s=time_s, kind=kind, arm="arm_0", job="x-1", value=0.0)
+        for time_s, kind in ((5.0, "award"), (79.0, "finish"), (79.5, "home"))
+    ]
+    assert record_wait(tmp_path / "6", 40.0, [silent], before=busy).startswith(f"{waits}boss did not reply")
     short = replace(silent, began_s=45.0, ended_s=60.0)
     assert record_wait(tmp_path / "3", 40.0, [short]).startswith(f"{waits}arm_0 was idle")
     paused = [(15.0, Pause("arm_0")), (78.0, Resume())]
