@@ -66,12 +66,14 @@ def submit_command(
         raise FleetError("--quote submits nothing: leave --wait out.")
     if as_json and not quote:
         raise FleetError("--json is for --quote: leave it out.")
-    from scenarios.live.requests import job_of, quote_jobs, read_jobs, submit_jobs
+    from scenarios.live.requests import job_of, places_of_cell, quote_jobs, read_jobs, submit_jobs
     from scenarios.show.words import clock
     from scenarios.spec.job_table import SUFFIXES
 
+    table = file if file.lower().endswith(SUFFIXES) else ""
     if file:
-        jobs = read_jobs(file, shift_begin)
+        places = places_of_cell(endpoint, fleet) if table and not quote else None
+        jobs = read_jobs(file, shift_begin, places)
         first_s = min((job.release_s for job in jobs.values()), default=0.0)
         if first_s > 0 and not shift_begin:
             say(f"Times count from fleet time 0: the first job is released at {clock(first_s)}. See --shift-begin.")
@@ -81,8 +83,7 @@ def submit_command(
     if quote:
         done = quote_jobs(tuple(jobs.values()), endpoint, fleet, timeout_s=timeout, as_json=as_json)
     else:
-        table = file if file.lower().endswith(SUFFIXES) else ""
-        done = submit_jobs(jobs, endpoint, fleet, by=by, wait=wait, table=table, begin=shift_begin)
+        done = submit_jobs(jobs, endpoint, fleet, by=by, wait=wait, table=table)
     if not done:
         raise typer.Exit(1)
 

@@ -459,10 +459,11 @@ def test_submitted_jobs_survive_a_kill(endpoint, tmp_path, thermofleet):
         assert code == 1
         assert out.startswith("a: accepted\nb: refused: No place 'moon' in this cell. Places: ")
         table = tmp_path / "jobs.csv"
-        table.write_text("name,kind,places,after\nc,hold,moon,\nd,hold,belt,\ne,hold,mars,\n")
+        table.write_text("name,kind,places,after,payload\nc,hold,moon,,\nd,hold,belt,,heavy\ne,hold,mars,,\n")
         code, out, err = thermofleet("job", "submit", table, *at)
         assert (code, out) == (2, "")
-        assert f"{table} has 2 faults:\n  row 2, column places: no place 'moon'. Allowed: " in err
+        assert f"{table} has 3 faults:\n  row 2, column places: no place 'moon'. Allowed: " in err
+        assert "row 3, column payload: expected a number (got 'heavy')." in err
         assert "row 4, column places: no place 'mars'" in err
         table.write_text("name,kind,places,after\na,hold,belt,\nd,hold,belt,\ne,hold,belt,no/one\n")
         code, out, _ = thermofleet("job", "submit", table, *at)
