@@ -99,7 +99,8 @@ def list_command(
     The age counts from the release, or from the acceptance if that is later.
     The end is the predicted one of a job that an arm has, and the true one of a
     finished job. A job is late if it ends after its due date, or waits beyond
-    it. A terminal that is too narrow for all columns shows some of them.
+    it. A terminal that is too narrow for all columns shows some of them, and a
+    very narrow one a sentence for each job.
     """
     import time
 

@@ -611,8 +611,11 @@ def test_a_list_of_jobs_has_a_line_for_each_and_ages_since_their_acceptance(endp
         _, new, planned = thermofleet(*listed)[1].splitlines()  # in a pipe
         monkeypatch.setenv("COLUMNS", "80")
         _, *narrow = thermofleet(*listed)[1].splitlines()
+        monkeypatch.setenv("COLUMNS", "20")
+        sentence, _ = thermofleet(*listed)[1].splitlines()  # wrapped by a terminal only
     assert " ".join(new.split()) == f"new waiting 0 of 12 2 min 0:50:00, 10 min late {why}"
     assert " ".join(planned.split()) == f"planned waiting 0 of 12 10 min {why}"
+    assert sentence == f"new: state waiting, cycles 0 of 12, age 2 min, due 0:50:00, 10 min late, reason {why}"
     assert [line.split()[:2] for line in narrow] == [["new", "waiting"], ["planned", "waiting"]]
     assert all(len(line) <= 80 and "It waits until the_arm" in line for line in narrow)
 
