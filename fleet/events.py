@@ -47,7 +47,9 @@ MEANINGS: dict[EventKind, Meaning] = {
     "home": Meaning("The arm is at home and free again.", live=True),
     "warning": Meaning("The motor of `joint` passed its warning limit.", "temperature, °C", live=True),
     "fault": Meaning("The motor of `joint` passed its fault limit: the arm stopped.", "temperature, °C", live=True),
-    "return": Meaning("After a fault the job is open again.", "cycles that are kept", live=True),
+    "return": Meaning(
+        "The job is open again: the arm faulted, or had to return it.", "cycles that are kept", live=True
+    ),
     "give_up": Meaning("Arms faulted in the job too often: it is abandoned."),
     "give_back": Meaning("The arm returned its job after a cycle.", "cycles that are kept"),
     "expire": Meaning("The due date passed before an arm began the job: it is abandoned."),

@@ -173,11 +173,18 @@ def print_wide(table: RenderableType) -> None:
 
 
 def print_lines(table: Table, leave_out: Sequence[str]) -> None:
-    """Print a table with a line for each row: whole without a terminal, else as `Table.in_lines`."""
-    if _has_width():
-        out_console.print(table.in_lines(out_console.width, leave_out))
-    else:
+    """Print a table with a line for each row: whole without a terminal, else as `Table.in_lines`.
+
+    On a terminal that is too narrow for that, each row is a sentence.
+    """
+    if not _has_width():
         SafeConsole(width=table.width).print(table)
+    elif (lines := table.in_lines(out_console.width, leave_out)).width <= out_console.width:
+        out_console.print(lines)
+    else:
+        for name, *cells in table.rows:
+            fields = zip(table.headings[1:], cells, strict=True)
+            say(f"{name}: {', '.join(f'{heading} {cell}' for heading, cell in fields if cell)}", out_console)
 
 
 def _has_width() -> bool:

@@ -4,6 +4,7 @@ import base64
 import copy
 import gzip
 import json
+import math
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -21,7 +22,7 @@ from plotly.offline import get_plotlyjs
 from fleet.events import Event
 from fleet.robot import ThermalLimits
 from fleet.telemetry import Telemetry
-from scenarios.run.records import JobRecord, Offer, ShiftLog
+from scenarios.run.records import Halt, JobRecord, Offer, ShiftLog
 from scenarios.show.charts import decimate
 from scenarios.show.run_page import (
     ROWS,
@@ -34,6 +35,7 @@ from scenarios.show.run_page import (
     verdict,
 )
 from scenarios.show.timeline import shift_charts, stream_of
+from scenarios.show.words import offer_text
 
 ARMS = ("arm_0", "arm_1")
 HOSTILE = '</script><img src="https://evil.example/x"><b>-001'
@@ -476,6 +478,19 @@ def test_late_jobs_turn_the_badge_red_and_abandoned_ones_come_last() -> None:
     assert lateness_text(log, late_jobs(log)[1:2]) == (
         "long-1 finished 1 min late: its work takes 15 min, and it was due 14 min after its release."
     )
+
+
+@pytest.mark.parametrize(("at_s", "why"), [(250.0, "place or space taken"), (350.0, "break"), (950.0, "paused")])
+def test_an_offer_names_the_break_or_the_pause_of_its_arm(at_s: float, why: str) -> None:
+    events = (event(300.0, "break", job="", value=600.0), event(900.0, "break_end", job=""), *done("a-1", 0.0, 200.0))
+    barred = replace(offered("b-1", at_s, 60.0), awarded=False, free=False, p_saturation=0.25)
+    log = replace(
+        log_of(telemetry(1000), ("arm_a", "arm_b"), (*events, event(at_s, "award", "arm_b", "b-1"))),
+        offers=(replace(offered("b-1", at_s, 60.0), arm="arm_b"), barred),
+        halts=(Halt(arm="arm_a", start_s=920.0, end_s=math.inf, reason="arm_a was paused by ann"),),
+    )
+    assert f"<td>arm_a: P 0.25, 1 min ({why})</td>" in report_html(log)
+    assert offer_text(log.offers_behind("b-1", "arm_b", at_s)[1]).endswith(f"({why})")  # as a trace has it
 
 
 def test_a_break_after_the_due_date_is_no_reason_to_be_late() -> None:

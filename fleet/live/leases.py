@@ -10,6 +10,9 @@ from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.journal import CommitPermitted, Progress, Released, SpaceCleared
 from fleet.live.records import BookRecord, ContactLost, ContactRegained, CountedLease, SendAward
 
+STOPPED_S = 1.0
+"""Real seconds after the end of a lease: a process that notices the end later was stopped meanwhile."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
@@ -68,6 +71,8 @@ def expire(book: JobBook, real_s: float, time_s: float) -> bool:
         if not grant.may_commit:
             missing = "renew its lease" if lease.unanswered is None else "answer the award"
             reason = f"'{arm}' did not {missing}."
+            if real_s > lease.until_s + STOPPED_S:  # it may have tried
+                reason = f"The lease of '{arm}' ended while nobody could renew it: the process that awards was stopped."
             if not book.try_to_record(vain, Released(award, job, arm, "dropped", lease.cycles, time_s, reason)):
                 return back
             back = True

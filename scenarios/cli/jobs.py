@@ -66,12 +66,14 @@ def submit_command(
         raise FleetError("--quote submits nothing: leave --wait out.")
     if as_json and not quote:
         raise FleetError("--json is for --quote: leave it out.")
-    from scenarios.live.requests import job_of, quote_jobs, read_jobs, submit_jobs
+    from scenarios.live.requests import job_of, places_of_cell, quote_jobs, read_jobs, submit_jobs
     from scenarios.show.words import clock
     from scenarios.spec.job_table import SUFFIXES
 
+    table = file if file.lower().endswith(SUFFIXES) else ""
     if file:
-        jobs = read_jobs(file, shift_begin)
+        places = places_of_cell(endpoint, fleet) if table and not quote else None
+        jobs = read_jobs(file, shift_begin, places)
         first_s = min((job.release_s for job in jobs.values()), default=0.0)
         if first_s > 0 and not shift_begin:
             say(f"Times count from fleet time 0: the first job is released at {clock(first_s)}. See --shift-begin.")
@@ -81,8 +83,7 @@ def submit_command(
     if quote:
         done = quote_jobs(tuple(jobs.values()), endpoint, fleet, timeout_s=timeout, as_json=as_json)
     else:
-        table = file if file.lower().endswith(SUFFIXES) else ""
-        done = submit_jobs(jobs, endpoint, fleet, by=by, wait=wait, table=table, begin=shift_begin)
+        done = submit_jobs(jobs, endpoint, fleet, by=by, wait=wait, table=table)
     if not done:
         raise typer.Exit(1)
 
@@ -98,7 +99,8 @@ def list_command(
     The age counts from the release, or from the acceptance if that is later.
     The end is the predicted one of a job that an arm has, and the true one of a
     finished job. A job is late if it ends after its due date, or waits beyond
-    it. A terminal that is too narrow for all columns shows some of them.
+    it. A terminal that is too narrow for all columns shows some of them, and a
+    very narrow one a sentence for each job.
     """
     import time
 

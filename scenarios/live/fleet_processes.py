@@ -14,11 +14,13 @@ import msgspec
 from agents.policy import no_simulator
 from fleet.bus.security.tls import Tls
 from fleet.errors import FleetError, nearest
+from fleet.files import atomic_path
 from fleet.live.supervisor import Part, Supervisor, share_memory
 from scenarios.cli.options import flags_of, split_names
 from scenarios.extras import require_extra
 from scenarios.live.auctioneer import folder_of, refuse_other_way
 from scenarios.policy_loader import plans, scope_of
+from scenarios.result_folder import disk_errors
 from scenarios.signals import until_stopped
 from scenarios.spec.load import load
 from scenarios.spec.options import PAGE_PORT, PORT, LiveSpec
@@ -34,6 +36,16 @@ SHARED = (
 """Modules of the participants, which `up` imports once, before it forks them; none may start a thread, as pyarrow."""
 SHARED_BY_PAGE = ("scenarios.live.gateway",)
 PROGRAM = (sys.executable, "-c", "from scenarios.cli.main import main; main()")
+
+
+CARD = "fleet.json"
+
+
+class FleetCard(msgspec.Struct, frozen=True):
+    """Content of `fleet.json` in the folder of a fleet."""
+
+    fleet: str
+    seed: int
 
 
 def parts_of(
@@ -117,7 +129,8 @@ def run_fleet(
     if page:
         _check_page(tls, webhooks)
     fleet, folder = folder_of(out, spec.fleet, chosen)
-    _refuse_other_fleet(folder, fleet)
+    card = FleetCard(fleet, spec.seed)
+    refuse_other_fleet(folder, card, new_epoch=spec.new_epoch)
     if tls is not None and fleet != chosen.name:
         raise FleetError(f"The keys of --tls are for the fleet of their scenario; leave --fleet out (got '{fleet}').")
     names = chosen_arms(arms, tuple(arm.name for arm in chosen.arms))
@@ -149,6 +162,8 @@ def run_fleet(
     count = f"{len(parts)} arm{'s' * (len(parts) > 1)}"
     central = f"{count}, which allocate the jobs" if auction is None else f"{count} and the auctioneer"
     say(f"Starting {count if router else f'the router, the recorder, {central}'} …", err_console)
+    with disk_errors(folder), atomic_path(folder / CARD) as draft:
+        draft.write_bytes(msgspec.json.encode(card))
     share_memory()
     from scenarios.cli.main import main
 
@@ -186,16 +201,23 @@ def run_fleet(
     stop.leave(f"The fleet was stopped; journals, recording and logs are in {folder}; the same command continues.")
 
 
-def _refuse_other_fleet(folder: Path, fleet: str) -> None:
-    """Refuse the folder of another fleet, whose jobs would be continued with the arms and places of this one.
+def refuse_other_fleet(folder: Path, card: FleetCard, *, new_epoch: bool = False) -> None:
+    """Refuse the folder of another fleet or seed, whose jobs would be continued with those of this one.
+
+    Args:
+        new_epoch: Whether another seed may begin.
 
     Raises:
-        FleetError: its recording is of another fleet.
+        FleetError: its card is of another fleet or seed.
     """
-    card = folder / "recording" / "recording.json"  # read without Arrow, whose threads no fork can share
-    with suppress(OSError, msgspec.DecodeError, KeyError):  # what is damaged, the recorder says
-        if (other := msgspec.json.decode(card.read_bytes(), type=dict)["fleet"]) != fleet:
-            raise FleetError(f"'{folder}' is of fleet '{other}', not of '{fleet}': give another --out.")
+    known = card
+    with suppress(OSError, msgspec.DecodeError):
+        known = msgspec.json.decode((folder / CARD).read_bytes(), type=FleetCard)
+    if known.fleet != card.fleet:
+        raise FleetError(f"'{folder}' is of fleet '{known.fleet}', not of '{card.fleet}': give another --out.")
+    if known.seed != card.seed and not new_epoch:
+        remedy = f"give --seed {known.seed} to continue it, or another --out"
+        raise FleetError(f"'{folder}' is of a fleet with --seed {known.seed} (got {card.seed}): {remedy}.")
 
 
 def page_of(

@@ -59,7 +59,8 @@ from fleet.bus.protocol.operator import (
 from fleet.env.render.heat import heat_scale
 from fleet.errors import NAME_RULE, BusError, FleetError, Refused, ScenarioError, is_name, nearest
 from fleet.live.job_client import batches
-from fleet.live.monitor.async_bridge import AsyncBridge, EventFeed, FeedEntry
+from fleet.live.monitor.async_bridge import MONITOR, AsyncBridge, EventFeed, FeedEntry
+from fleet.live.monitor.health import Finding
 from fleet.live.monitor.snapshot import MAX_JOBS
 from fleet.live.supervisor import return_memory
 from scenarios.cli.options import the_fleet
@@ -728,7 +729,13 @@ async def serve(
         for hook in hooks:
             hook.send(alarm)
 
-    async with AsyncBridge(link, readers.wake, kept=kept, on_alarm=tell) as bridge, AsyncExitStack() as running:
+    def check_hooks() -> list[Finding]:
+        return [finding for hook in hooks for finding in hook.findings()]
+
+    address, bound_port, *_ = bound.getsockname()
+    monitor = f"{MONITOR}-{bound_port}"  # without certificates all gateways of a fleet are on one machine
+    bridge = AsyncBridge(link, readers.wake, monitor=monitor, kept=kept, on_alarm=tell, more_findings=check_hooks)
+    async with bridge, AsyncExitStack() as running:
         for hook in hooks:
             running.callback(asyncio.create_task(hook.run()).cancel)
         server = Server(application(bridge, readers, tokens=tokens, page=page), readers)
@@ -738,7 +745,6 @@ async def serve(
 
         for number in (signal.SIGINT, signal.SIGTERM):
             asyncio.get_running_loop().add_signal_handler(number, stop, number)
-        address, bound_port, *_ = bound.getsockname()
         shown = f"[{address}]" if ":" in address else address
         kind, path = ("gateway", "/v4") if page is None else ("page", "/")
         return_memory()

@@ -3,14 +3,21 @@
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from itertools import product
+from typing import get_args
 
+from fleet.bus.protocol.auction import JobState
 from fleet.live.job_rules import waits_since_s
-from fleet.live.monitor.health import reason_class
+from fleet.live.monitor.health import ALARM_KINDS, OTHER, REASONS, reason_class
 from fleet.live.monitor.snapshot import FleetSnapshot
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 METRICS: Mapping[str, tuple[str, str]] = {
-    "jobs": ("gauge", "Jobs by state."),
+    "jobs": ("gauge", "Jobs by state, of those that the gateway keeps."),
+    "job_changes_total": (
+        "counter",
+        "Changes of jobs to a state since the gateway began, as an auctioneer publishes them.",
+    ),
     "waiting_jobs": ("gauge", "Waiting jobs by class of reason."),
     "oldest_waiting_seconds": (
         "gauge",
@@ -55,10 +62,13 @@ def exposition(fleet: FleetSnapshot, alarms: Counter[tuple[str, str]]) -> str:
 
 def samples(fleet: FleetSnapshot, alarms: Counter[tuple[str, str]]) -> Iterable[Sample]:
     """Name, labels and value of every sample; arguments as of `exposition`."""
-    yield from (("jobs", {"state": state}, count) for state, count in fleet.counts.items())
+    for state in get_args(JobState):
+        yield "jobs", {"state": state}, fleet.counts.get(state, 0)
+        yield "job_changes_total", {"state": state}, fleet.changes.get(state, 0)
     waiting = [status for status in fleet.jobs if status.state == "waiting"]
-    for reason, count in Counter(reason_class(status.reason) for status in waiting).items():
-        yield "waiting_jobs", {"reason": reason}, count
+    reasons = Counter(reason_class(status.reason) for status in waiting)
+    for reason in dict.fromkeys((*REASONS.values(), OTHER)):
+        yield "waiting_jobs", {"reason": reason}, reasons[reason]
     now_s = max((arm.time_s for arm in fleet.arms if arm.time_s is not None), default=None)
     if now_s is not None:
         since_s = [since_s for status in waiting if (since_s := waits_since_s(status)) is not None]
@@ -80,8 +90,8 @@ def samples(fleet: FleetSnapshot, alarms: Counter[tuple[str, str]]) -> Iterable[
     for auctioneer in fleet.auctioneers:
         labels = {"participant": auctioneer.auctioneer, "role": "auctioneer"}
         yield "silence_seconds", labels, auctioneer.heard_age_s
-    for (kind, acknowledged), count in alarms.items():
-        yield "alarms", {"kind": kind, "acknowledged": acknowledged}, count
+    for kind, acknowledged in product(ALARM_KINDS, ("no", "yes")):
+        yield "alarms", {"kind": kind, "acknowledged": acknowledged}, alarms[kind, acknowledged]
     yield "fleet_speed", {}, fleet.speed
 
 

@@ -220,7 +220,8 @@ class Recorder:
             self.missing.append(gap)
             count.missed += number - expected
         count.kept += 1
-        count.last, count.time_s = number, time_s
+        count.last = number
+        count.time_s = time_s if begins or restarted else max(count.time_s, time_s)
         return True
 
     def _fill(self, series: Series, count: SenderCount, time_s: float) -> bool:

@@ -93,7 +93,7 @@ class SenderCount:
     last: int = -1
     """Number of the last message."""
     time_s: float = -math.inf
-    """Fleet time of the last message."""
+    """Latest fleet time of a message since the last start of the sender."""
     epochs: tuple[str, ...] = ()
 
 

@@ -21,16 +21,17 @@ import pyarrow.compute as pc
 from fleet.arm.cell import cell_model
 from fleet.bus.protocol.auction import ArmOffer, PlanQuote
 from fleet.bus.protocol.cell import Cell
-from fleet.bus.protocol.operator import ALL_ARMS
+from fleet.bus.protocol.operator import ALL_ARMS, Alarm
 from fleet.errors import FleetError
 from fleet.events import EVENT_KINDS, Event
 from fleet.heat.effects import arrhenius_rate, life_used, most_drift_m, segment_temperatures
+from fleet.live.job_rules import EXPIRED
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
 from scenarios.live.cell import described_model
-from scenarios.live.recording import Kind, lost_rows, read_card, read_parts
+from scenarios.live.recording import Kind, alarms_of, lost_rows, read_card, read_parts
 from scenarios.run.log import UNITS, joint_values
-from scenarios.run.records import SAME_MOMENT_DIGITS, Offer, ShiftLog
+from scenarios.run.records import SAME_MOMENT_DIGITS, Halt, JobRecord, Notice, Offer, ShiftLog
 from scenarios.show.run_page import report_html
 from scenarios.show.words import clock
 from scenarios.spec.schema import Scenario
@@ -45,7 +46,7 @@ _ENDED = ("waiting", "given_up", "unfinished", "cancelled")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RecordingLog(ShiftLog):
-    """A live recording as the log of a shift: its last epoch, without jobs."""
+    """A live recording as the log of a shift: its last epoch."""
 
     model: Mapping[str, Any] | None
     """`fleet.arm.cell.cell_model`; None if the cell is not known."""
@@ -73,29 +74,36 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
     if not arms:
         raise FleetError(f"'{folder}' holds no state of an arm yet; record longer.")
     limits, model = _cell(scenario, card.cell, arms)
+    alarms = alarms_of(folder) if len(epochs) < 2 else []  # they name no epoch
     ordered = order_events(arm_events(log), _returns(results))
     events = tuple(event for event in ordered if event.arm in arms)
     telemetry = telemetry_of(table, arms)
+    jobs = tuple(job_records(results))
     shown = {
         "status": "running" if card.status == "recording" else card.status,
         "scenario": {"name": card.fleet},
         "policy": "live recording",
-        "metrics": _metrics(telemetry, events, results, arms, limits.warning_c) | heat_use(table, arms),
+        "metrics": _metrics(telemetry, events, jobs, arms, limits.warning_c) | heat_use(table, arms),
         "messages": {
             sender: f"{count.kept} recorded, {count.missed} missing" for sender, count in card.senders.items()
         },
         "missing": _missing(read_parts(folder, "gaps"), lost_rows(folder)),
         "jobs submitted by": _submitters(results),
-        "requests": [_describe_request(row) for row in operations.to_pylist()],
     }
     if len(epochs) > 1:
-        shown["epochs"] = f"{len(epochs)} are recorded here; this page shows the last one, {[*epochs][-1]}"
+        shown["epochs"] = (
+            f"{len(epochs)} are recorded here; this page shows the last one, {[*epochs][-1]}, without alarms"
+        )
     return RecordingLog(
         card=shown,
         arms=arms,
         limits=limits,
         readings=telemetry,
         events=events,
+        jobs=jobs,
+        notices=(*map(_request_notice, operations.to_pylist()), *_alarm_notices(alarms, arms, jobs)),
+        halts=tuple(_halts(alarms, operations)),
+        ended_s=min((row["time_s"] for row in results.to_pylist() if row["shift_ended"]), default=math.inf),
         offers=tuple(offer for row in results.to_pylist() for offer in offers_of(row)),
         model=model,
     )
@@ -220,11 +228,33 @@ def arm_events(table: pa.Table) -> list[Event]:
     ]
 
 
+def job_records(results: pa.Table) -> Iterator[JobRecord]:
+    """Jobs as at the end of a recording, in order of their first result; payloads are not recorded and count as 0."""
+    last: dict[str, dict[str, Any]] = {}
+    for row in results.to_pylist():
+        if row["job"] not in last or last[row["job"]]["state"] != "finished":  # final; what was reported late came late
+            last[row["job"]] = row
+    for job, row in last.items():
+        release_s = row["release_s"] or row["accepted_s"]  # 0: as soon as it is accepted
+        yield JobRecord(
+            job=job,
+            state="expired" if row["reason"] == EXPIRED else row["state"],
+            release_s=math.nan if release_s is None else release_s,
+            due_s=math.inf if row["due_s"] is None else row["due_s"],
+            finished_s=row["finished_s"],
+            value=math.nan if row["value"] is None else row["value"],
+            payload_kg=0.0,
+            cycles=row["repetitions"],
+        )
+
+
 def _returns(results: pa.Table) -> list[Event]:
     """A `return` for each job that an arm had and has no more, though it did not finish it."""
     out: list[Event] = []
     holder: dict[str, str] = {}
     for row in results.to_pylist():
+        if row["shift_ended"]:
+            continue
         if row["state"] in _ENDED and (arm := holder.pop(row["job"], "")):
             reason = row["reason"] or "the arm returned the job, or lost its lease"
             out.append(
@@ -252,8 +282,8 @@ def telemetry_of(table: pa.Table, arms: Sequence[str]) -> Telemetry:
     mode = np.zeros(shape[:2], int)
     for a, arm in enumerate(arms):
         rows, times = np.flatnonzero(names == arm), own_s[a]
-        last = np.searchsorted(times, time_s, side="right") - 1
-        fresh = (last >= 0) & (time_s - times[last] <= ABSENT_SAMPLES * step_s)
+        last = np.maximum(np.searchsorted(times, time_s, side="right") - 1, 0)  # its first one also shortly before
+        fresh = np.abs(time_s - times[last]) <= ABSENT_SAMPLES * step_s
         mode[fresh, a] = modes[rows[last[fresh]]]
         for name, values in readings.items():
             out[name][fresh, a] = values[rows[last[fresh]]]
@@ -280,26 +310,27 @@ def offers_of(row: Mapping[str, Any]) -> Iterator[Offer]:
 
 
 def _metrics(
-    telemetry: Telemetry, events: Sequence[Event], results: pa.Table, arms: Sequence[str], warning_c: float
+    telemetry: Telemetry, events: Sequence[Event], jobs: Sequence[JobRecord], arms: Sequence[str], warning_c: float
 ) -> dict[str, Any]:
     """Key figures, named as in a run; what only the simulator knows is left out."""
     late_s = [event.value for event in events if event.kind == "finish"]
-    states = {row["job"]: row["state"] for row in results.to_pylist()}
-    jobs = set(states) | {event.job for event in events if event.job}
+    states = Counter(job.state for job in jobs)
+    names = {job.job for job in jobs} | {event.job for event in events if event.job}
     step_s = float(telemetry.time_s[1] - telemetry.time_s[0]) if len(telemetry.time_s) > 1 else 0.0
     span_h = float(telemetry.time_s[-1] - telemetry.time_s[0]) / 3600.0
     seen = np.asarray(np.isfinite(telemetry.temp_c).any(axis=2))
-    finished = max(len(late_s), sum(state == "finished" for state in states.values()))
+    finished = max(len(late_s), states["finished"])
     hot = (np.nan_to_num(telemetry.temp_c, nan=-np.inf) > warning_c).any(axis=2)
     peaks = {arm: float(np.nanmax(telemetry.temp_c[:, a])) for a, arm in enumerate(arms) if seen[:, a].any()}
     return {
-        "jobs": len(jobs),
+        "jobs": len(names),
         "finished": finished,
         "on_time": sum(not late for late in late_s),
         "tardiness_min": float(np.nansum(late_s)) / 60.0,
         "faults": sum(event.kind == "fault" for event in events),
-        "given_up": sum(state == "given_up" for state in states.values()),
-        "unfinished": sum(state == "unfinished" for state in states.values()),
+        "given_up": states["given_up"],
+        "expired": states["expired"],
+        "unfinished": states["unfinished"],
         "above_warning_min": float(hot.sum()) * step_s / 60.0,
         "availability": float(1.0 - (telemetry.mode[seen] == FAULTED).mean()) if seen.any() else None,
         "utilisation": float((telemetry.mode[seen] == WORKING).mean()) if seen.any() else None,
@@ -350,13 +381,47 @@ def _submitters(results: pa.Table) -> Mapping[str, int]:
     return Counter(by or "nobody named" for by in first.values())
 
 
-def _describe_request(row: Mapping[str, Any]) -> tuple[str, ...]:
-    """Time, action, what it concerns, and who asked."""
+def _request_notice(row: Mapping[str, Any]) -> Notice:
+    """What a person requested, from a row of the operations."""
     action = json.loads(row["content"])["action"]
-    details = (
-        f"{key.removesuffix('_s')} {action[key]}".removeprefix("outcome ")
-        for key in ("outcome", "due_s", "value")
-        if key in action
-    )
-    concerns = row["job"] or ("all arms" if row["arm"] == ALL_ARMS else row["arm"])
-    return clock(row["time_s"]), " ".join((row["action"], *details)), concerns, row["by"]
+    details = [f"as {action['outcome']}"] if "outcome" in action else []
+    if "due_s" in action:
+        details.append("no due date" if action["due_s"] is None else f"due at {clock(action['due_s'])}")
+    details += [f"value {action['value']:g}"] if "value" in action else []
+    arm = "all arms" if row["arm"] == ALL_ARMS else row["arm"]
+    reason = ", ".join((*details, f"by {row['by'] or 'nobody named'}"))
+    return Notice(time_s=row["time_s"], kind=row["action"], arm=arm, job=row["job"], reason=reason)
+
+
+def _alarm_notices(alarms: Sequence[Alarm], arms: Sequence[str], jobs: Sequence[JobRecord]) -> Iterator[Notice]:
+    """When each alarm began, and was acknowledged by whom, and ended."""
+    names, before = {job.job for job in jobs}, dict[str, Alarm]()
+    for alarm in alarms:
+        known = before.get(alarm.alarm)
+        before[alarm.alarm] = alarm
+        changes = [(known is None, alarm.began_s, "alarm", alarm.what)]
+        seen = alarm.by and not (known and known.by)
+        changes.append((bool(seen), alarm.time_s, "alarm_acknowledged", f"by {alarm.by}: {alarm.what}"))
+        ended = alarm.ended_s is not None and (known is None or known.ended_s is None)
+        changes.append((ended, alarm.ended_s or 0.0, "alarm_ended", alarm.what))
+        arm, job = (alarm.subject if alarm.subject in those else "" for those in (arms, names))
+        for changed, time_s, kind, reason in changes:
+            if changed:
+                yield Notice(time_s=time_s, kind=kind, arm=arm, job=job, reason=reason)
+
+
+def _halts(alarms: Sequence[Alarm], operations: pa.Table) -> Iterator[Halt]:
+    """When nobody replied about the jobs, and when arms were paused."""
+    for alarm in {alarm.alarm: alarm for alarm in alarms if alarm.kind == "silent"}.values():
+        end_s = math.inf if alarm.ended_s is None else alarm.ended_s
+        yield Halt(arm="", start_s=alarm.began_s, end_s=end_s, reason=f"{alarm.subject} did not reply")
+    paused: dict[str, Halt] = {}
+    for row in operations.to_pylist():
+        arm = "" if row["arm"] == ALL_ARMS else row["arm"]
+        if row["action"] == "pause":
+            reason = f"{f'{arm} was' if arm else 'all arms were'} paused by {row['by'] or 'nobody named'}"
+            paused.setdefault(arm, Halt(arm=arm, start_s=row["time_s"], end_s=math.inf, reason=reason))
+        elif row["action"] == "resume":
+            for ended in [each for each in paused if arm in ("", each)]:
+                yield replace(paused.pop(ended), end_s=row["time_s"])
+    yield from paused.values()

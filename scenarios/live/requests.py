@@ -69,19 +69,16 @@ def submit_jobs(
     by: str = "",
     wait: bool = False,
     table: str = "",
-    begin: str = "",
 ) -> bool:
     """Submit jobs and print the decision on each; return whether all are accepted and, after a wait, finished.
 
     Args:
         jobs: By number, as from `read_jobs`.
         wait: Follow the accepted jobs to their end.
-        table: The job table that has them, to name its rows. If the cell lacks one of its places, nothing is submitted.
-        begin: As for `read_jobs`.
+        table: The job table that has them, to name its rows.
 
     Raises:
-        FleetError: the submission is refused, there is no auctioneer, it disappears while jobs are followed, or the
-            cell lacks places of a job table.
+        FleetError: the submission is refused, there is no auctioneer, or it disappears while jobs are followed.
     """
     states = dict[str, str]()
     rows = {job.name: (f"{table}, row {number}", job) for number, job in jobs.items() if table}
@@ -94,12 +91,6 @@ def submit_jobs(
     with until_stopped() as stop, BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
         client = JobClient(link, by, show_change)
         try:
-            if table:
-                with suppress(Refused, NoReply):  # no participant knows the cell
-                    cell = link.ask(keys.of_jobs(link.fleet, "cell"), CellRequest(), Cell, timeout_s=REPLY_S)
-                    read_job_table(
-                        Path(table), begin=shift_begin(begin, ""), places=[each.name for each in cell.places]
-                    )
             admissions = [with_cell(each, rows) for each in client.submit_and_wait(tuple(jobs.values()))]
         except Refused as error:
             raise FleetError(f"The auctioneer refused the submission: {error}") from error
@@ -159,20 +150,29 @@ def _is_unplanned(answers: Replies[Quote]) -> bool:
     return any(estimate.reason == NOT_PLANNED for estimate in estimates)
 
 
-def read_jobs(file: str, begin: str = "") -> dict[int, JobSpec]:
+def places_of_cell(endpoint: str, fleet: str) -> list[str] | None:
+    """Names of the places in the cell of a fleet; None if no participant replies with them."""
+    with suppress(FleetError), BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
+        cell = link.ask(keys.of_jobs(link.fleet, "cell"), CellRequest(), Cell, timeout_s=REPLY_S)
+        return [place.name for place in cell.places]
+    return None
+
+
+def read_jobs(file: str, begin: str = "", places: Sequence[str] | None = None) -> dict[int, JobSpec]:
     """Read the jobs of a file of JSON, or of standard input for `-`, or of a job table by its suffix.
 
     They are numbered by the lines or rows of the file, or by their places in a list.
 
     Args:
         begin: Date, time and zone of fleet time 0, for the dates in a job table.
+        places: Of the cell, for those in a job table; None: not checked.
 
     Raises:
         FleetError: a job is invalid; names the line, or the index in the list. Of a job table all faults are named.
     """
     shift = shift_begin(begin, "--shift-begin")
     if file.lower().endswith(SUFFIXES):
-        return read_job_table(Path(file), begin=shift)
+        return read_job_table(Path(file), begin=shift, places=places)
     if shift:
         raise FleetError(f"--shift-begin is for a job table, a file that ends in {', '.join(SUFFIXES)} (got {file}).")
     name = "standard input" if file == "-" else file

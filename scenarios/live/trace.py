@@ -5,6 +5,7 @@ from bisect import bisect
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from difflib import get_close_matches
+from math import isfinite
 from pathlib import Path
 from typing import Any  # values of run.json
 
@@ -106,7 +107,10 @@ def _recorded_jobs(folder: Path) -> dict[str, dict[str, Any]]:
     jobs: dict[str, dict[str, Any]] = {}
     for row in read_parts(folder, "results").to_pylist():
         job = jobs.setdefault(row["job"], {})
-        job |= {name: row[name] for name in ("job", "state", "due_s", "finished_s", "value", "cycles", "repetitions")}
+        job |= {
+            name: row[name]
+            for name in ("job", "state", "release_s", "due_s", "finished_s", "value", "cycles", "repetitions")
+        }
         if row["award"]:
             job |= {name: row[name] for name in ("award", "auctioneer", "difficulty", "p_saturation", "peak_c")}
     return jobs
@@ -160,7 +164,7 @@ def thread_table(thread: Thread) -> Table:
     row("event", f"row {thread.row} of {thread.folder}", alike, "…" if len(others) > 5 else "")
     row("", *_words(event), MEANINGS[event.kind].text)
     if thread.job:
-        row("job", *_pairs(thread.job))
+        row("job", *_pairs({name.removesuffix("_s"): _moment(name, value) for name, value in thread.job.items()}))
     if thread.award is not None:
         award = thread.award
         d = f"d {award.value:.2f}" if award.value == award.value else ""
@@ -211,6 +215,11 @@ def _plan(offers: tuple[Offer, ...], award: Event) -> list[str]:
     if number is None:
         return [NOT_RECORDED, duration]
     return [f"plan {number}, the {'coolest' if number else 'fastest'} that was offered", duration]
+
+
+def _moment(name: str, value: object) -> object:
+    """A value of a job, a time in seconds as a time of the shift."""
+    return clock(value) if name.endswith("_s") and isinstance(value, float) and isfinite(value) else value
 
 
 def _pairs(values: Mapping[str, Any]) -> list[str]:

@@ -19,6 +19,7 @@ from urllib.parse import urlsplit
 from fleet.bus.protocol.messages import encode
 from fleet.bus.protocol.operator import Alarm
 from fleet.errors import FleetError, printable
+from fleet.live.monitor.health import Finding
 
 _LOG = logging.getLogger(__name__)
 
@@ -34,7 +35,11 @@ RETRY_S = (1.0, 5.0, 30.0, 120.0)
 
 
 class Webhook:
-    """One target: `run` sends what `send` has queued; both on the event loop."""
+    """One target: `run` sends what `send` has queued; both on the event loop.
+
+    Attributes:
+        problem: Why the target has accepted no alarm since, after a repetition; "" if the last one was accepted.
+    """
 
     def __init__(self, url: str, secret: str) -> None:
         """Prepare.
@@ -55,7 +60,7 @@ class Webhook:
         if parts.scheme == "http" and not _is_loopback(host):
             raise FleetError(f"--webhook beyond this machine must be https:// (got '{printable(url)}').")
         self._port = port or (443 if parts.scheme == "https" else 80)
-        self.url, self._secret, self._host = url, secret.encode(), host
+        self.url, self.problem, self._secret, self._host = url, "", secret.encode(), host
         self._named = f"[{host}]" if ":" in host else host
         self._tls = ssl.create_default_context() if parts.scheme == "https" else None
         self._path = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
@@ -77,14 +82,23 @@ class Webhook:
                 await self._woken.wait()
                 continue
             body = self._waiting.popleft()
-            for wait_s in (*RETRY_S, None):
+            for attempt, wait_s in enumerate((*RETRY_S, None)):
                 problem = await self._attempt(body)
+                if not problem or attempt:  # one attempt may fail
+                    self.problem = problem
                 if not problem:
                     break
                 if wait_s is None:
                     _LOG.error("'%s' did not accept an alarm (%s): it is dropped there.", self.url, problem)
                 else:
                     await asyncio.sleep(wait_s)
+
+    def findings(self) -> tuple[Finding, ...]:
+        """A warning while the target accepts nothing; without the path of the URL, which may be secret."""
+        if not (problem := self.problem):
+            return ()
+        target = f"{self._named}:{self._port}"
+        return (Finding("warning", f"The webhook at {target} accepts no alarms: {problem}.", "webhook", target),)
 
     async def _attempt(self, body: bytes) -> str:
         """Send one request; return why it was not accepted, or ""."""

@@ -236,9 +236,11 @@ class JobRecord:
 
     job: str
     state: str
-    """One of `JOB_STATES`."""
+    """One of `JOB_STATES`; in a recording also another state of `fleet.bus.protocol.auction.JobState`."""
     release_s: float
+    """NaN if it was not recorded."""
     due_s: float
+    """Infinite without a due date."""
     finished_s: float | None
     """None if it was not finished."""
     value: float
@@ -272,6 +274,32 @@ class Offer:
     """Number of that plan: 0 is the fastest, 1 the coolest; None without a plan, and in runs of earlier versions."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Notice:
+    """In a live fleet: an alarm began, was acknowledged or ended, or a person requested something."""
+
+    time_s: float
+    kind: str
+    """alarm, alarm_acknowledged or alarm_ended; of a request its action, such as pause."""
+    arm: str
+    """"" for none, as the job."""
+    job: str
+    reason: str
+    """What is wrong, or who requested it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Halt:
+    """Time in which an arm of a live fleet got no job whatever it did."""
+
+    arm: str
+    """"" for all arms."""
+    start_s: float
+    end_s: float
+    """Infinite if it lasted to the end."""
+    reason: str
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShiftLog:
     """A shift of a simulated or of a live fleet, as its readers need it."""
@@ -288,6 +316,10 @@ class ShiftLog:
     jobs: tuple[JobRecord, ...] = ()
     offers: tuple[Offer, ...] = ()
     """Offers of all arms at every award."""
+    notices: tuple[Notice, ...] = ()
+    halts: tuple[Halt, ...] = ()
+    ended_s: float = inf
+    """End of the shift, if it was before the last reading."""
 
     @cached_property
     def begin(self) -> datetime | None:
@@ -320,12 +352,25 @@ class ShiftLog:
         horizon_s = float(self.card.get("scenario", {}).get("horizon_s", 0.0))
         return schedule(self.events, self.arms, max(ends_s, default=horizon_s))
 
+    @cached_property
+    def known_offers(self) -> tuple[Offer, ...]:
+        """`offers`, with the state `break` or `paused` of an idle arm that had a break, or that people had paused."""
+        spans = [*((each, "break") for each in self.plan.breaks), *((each, "paused") for each in self.halts)]
+
+        def known(offer: Offer) -> Offer:
+            if offer.free or offer.state != "idle":
+                return offer
+            whys = (why for span, why in spans if span.arm == offer.arm and span.start_s <= offer.time_s < span.end_s)
+            return replace(offer, state=next(whys, offer.state))
+
+        return tuple(map(known, self.offers))
+
     def offers_behind(self, job: str, arm: str, time_s: float) -> tuple[Offer, ...]:
         """Offers of all arms at the award of a job to an arm; in a recording its time is that of another clock, so the
         award nearest the time is meant."""
-        times_s = [each.time_s for each in self.offers if each.awarded and (each.job, each.arm) == (job, arm)]
+        times_s = [each.time_s for each in self.known_offers if each.awarded and (each.job, each.arm) == (job, arm)]
         award_s = min(times_s, key=lambda each: abs(each - time_s), default=None)
-        return tuple(each for each in self.offers if (each.job, each.time_s) == (job, award_s))
+        return tuple(each for each in self.known_offers if (each.job, each.time_s) == (job, award_s))
 
     @cached_property
     def load_kg(self) -> Array:

@@ -99,7 +99,8 @@ class Moments:
     def log(self) -> Iterator[LogLine]:
         """Events in order of time; an award is followed by what each arm offered."""
         offers = {
-            key: list(group) for key, group in groupby(self.run.offers, key=lambda offer: (offer.time_s, offer.job))
+            key: list(group)
+            for key, group in groupby(self.run.known_offers, key=lambda offer: (offer.time_s, offer.job))
         }
         for event in sorted(self.run.events, key=lambda event: event.time_s):
             yield LogLine(event.time_s, SEVERITY.get(event.kind, "info"), event.arm, event_text(event))

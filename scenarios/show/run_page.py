@@ -13,7 +13,7 @@ import numpy as np
 
 from fleet.env.render.heat import heat_scale
 from fleet.events import Event
-from scenarios.run.records import JobSpan, Offer, ShiftLog
+from scenarios.run.records import Halt, JobSpan, Notice, Offer, Outage, ShiftLog
 from scenarios.show.charts import AXIS, COLOURS, LAYOUT, Figure, named_rows, plain
 from scenarios.show.page import Badge, Chart, Head, Page, Playback, Section, packed
 from scenarios.show.timeline import STREAM_NAME, hottest_motors, shift_charts, stream_of, time_unit
@@ -70,6 +70,7 @@ def verdict(log: ShiftLog) -> Verdict:
         sentences.append(
             f"Arms touched something {f'{contacts} times' if contacts > 1 else 'once'}: see the events below."
         )
+    sentences += [f"{_halt(log, halt)}: no job was awarded." for halt in log.halts if not halt.arm]
     if late := late_jobs(log):
         sentences.append(lateness_text(log, late))
         moments[sentences[-1]] = Moment(late[0].due_s)
@@ -194,8 +195,8 @@ def _avoidable(fault: Event, own: Offer, offered: Sequence[Offer], log: ShiftLog
 
 def _occupied(offer: Offer, log: ShiftLog) -> str:
     """Why an arm could not take a job, or until when."""
-    if offer.state == "faulted":
-        return "which was out after a fault"
+    if why := {"faulted": "was out after a fault", "break": PAUSED, "paused": "was paused"}.get(offer.state):
+        return f"which {why}"
     plan = log.plan
     current = plan.at(offer.arm, offer.time_s)
     if current is None or current.end_s == offer.time_s:
@@ -214,7 +215,7 @@ class LateJob:
     late_s: float
     """Tardiness; of an unfinished job until the end of the shift."""
     state: str
-    """finished, waiting or running; or, of an abandoned job, given_up or expired."""
+    """As in `JobRecord`."""
 
     @property
     def abandoned(self) -> bool:
@@ -223,19 +224,18 @@ class LateJob:
 
 
 def late_jobs(log: ShiftLog) -> list[LateJob]:
-    """Jobs that passed their due date, finished or not: the latest first, abandoned ones last.
-
-    A recording of a live fleet states no due dates, so it has only those that finished late.
-    """
+    """Jobs that passed their due date, finished or not but not cancelled: the latest first, abandoned ones last."""
+    end_s = min(log.plan.horizon_s, log.ended_s)
+    finished = {event.job for event in log.events if event.kind == "finish"}  # its result may not be recorded yet
     late = [
         LateJob(job=event.job, due_s=event.time_s - event.value, late_s=event.value, state="finished")
         for event in log.events
         if event.kind == "finish" and event.value > 0
     ]
     late += [
-        LateJob(job=job.job, due_s=job.due_s, late_s=log.plan.horizon_s - job.due_s, state=job.state)
+        LateJob(job=job.job, due_s=job.due_s, late_s=end_s - job.due_s, state=job.state)
         for job in log.jobs
-        if job.state != "finished" and job.due_s < log.plan.horizon_s
+        if job.state not in ("finished", "cancelled") and job.job not in finished and job.due_s < end_s
     ]
     return sorted(late, key=lambda each: (each.abandoned, -each.late_s, each.job))
 
@@ -273,12 +273,12 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
     own = sorted((span for span in log.plan.assignments if span.job == late.job), key=lambda span: span.start_s)
     for span in own:
         if span.outcome in ("returned", "given_up"):
-            return f"{span.arm} {'faulted during' if span.faulted else 'returned'} it at {clock(span.end_s, log.begin)}"
-    times_s = {event.kind: event.time_s for event in log.events if event.job == late.job}
-    begin_s = times_s.get("release")
-    if begin_s is None:
+            how = f"{span.arm} {'faulted during' if span.faulted else 'returned'} it at {clock(span.end_s, log.begin)}"
+            return how if span.faulted else f"{how}{_return_reason(log, span)}"
+    begin_s = next((job.release_s for job in log.jobs if job.job == late.job), math.nan)
+    if math.isnan(begin_s):
         return "its release is not recorded"
-    end_s = own[0].start_s if own else times_s.get("expire", log.plan.horizon_s)
+    end_s = own[0].start_s if own else late.due_s if late.state == "expired" else log.plan.horizon_s
     took_s = (own[0].finished_s or own[0].end_s) - end_s if own else 0.0
     if begin_s + took_s > late.due_s:
         return f"its work takes {duration(took_s)}, and it was due {duration(late.due_s - begin_s)} after its release"
@@ -287,15 +287,29 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
     able = [arm for arm in log.arms if any(offer.feasible and offer.arm == arm for offer in offers)]
     if not able:
         return "no arm got a job of its kind"
-    waits_s = _arm_time(log, able, begin_s, end_s)
+    halts = {_halt(log, halt): halt for halt in log.halts if halt.start_s < late.due_s}
+    waits_s = _arm_time(log, able, begin_s, end_s, halts)
     if all(each.start_s >= late.due_s for each in log.plan.breaks):
         waits_s.pop(PAUSED)  # it was late before
     most = max(waits_s, key=lambda why: waits_s[why])
     if not waits_s[most]:
         return f"what {names_text(able)} did meanwhile is not recorded"
     if most:
-        return f"{names_text(able)} {most}"
+        return most if most in halts else f"{names_text(able)} {most}"
     return _passed(log, late, able, begin_s, end_s)
+
+
+def _halt(log: ShiftLog, halt: Halt) -> str:
+    """What kept an arm, or all of them, from getting jobs, and when."""
+    until = f"to {clock(halt.end_s, log.begin)}" if halt.end_s < log.plan.horizon_s else "to the end"
+    return f"{halt.reason} from {clock(halt.start_s, log.begin)} {until}"
+
+
+def _return_reason(log: ShiftLog, span: JobSpan) -> str:
+    """Why an arm returned a job, after a colon; "" if it is unknown."""
+    key = "return", span.arm, span.job, span.end_s
+    reason = next((e.reason for e in log.events if (e.kind, e.arm, e.job, e.time_s) == key), "").rstrip(".")
+    return f": {reason[0].lower()}{reason[1:]}" if reason else ""
 
 
 def _passed(log: ShiftLog, late: LateJob, able: Sequence[str], begin_s: float, end_s: float) -> str:
@@ -324,22 +338,27 @@ def _passed(log: ShiftLog, late: LateJob, able: Sequence[str], begin_s: float, e
     return f"{len(ahead)} other job{'s' * (len(ahead) > 1)} went first on {names_text(arms)}{which}"
 
 
-def _arm_time(log: ShiftLog, able: Sequence[str], begin_s: float, end_s: float) -> dict[str, float]:
-    """Time of the arms that can do a job between its release and its award, s, by what they did; "": later jobs."""
+def _arm_time(
+    log: ShiftLog, able: Sequence[str], begin_s: float, end_s: float, halts: Mapping[str, Halt]
+) -> dict[str, float]:
+    """Time of the arms that can do a job between its release and its award, s, by what they did, or by what kept them
+    from getting jobs; "": later jobs."""
     were = "were" if len(able) > 1 else "was"
     earlier, out = f"{were} at work since before its release", f"{were} out after a fault"
     failed, paused = f"{were} out after a failure", PAUSED
     hot, idle = f"{were} idle above the warning limit", f"{were} idle: its place was taken, or the policy let it wait"
-    time_s: dict[str, float] = dict.fromkeys(("", earlier, out, failed, paused, hot, idle), 0.0)
+    time_s: dict[str, float] = dict.fromkeys((*halts, "", earlier, out, failed, paused, hot, idle), 0.0)
     at_s = log.readings.time_s
     step_s = float(np.median(np.diff(at_s))) if len(at_s) > 1 else 0.0
     for arm in able:
         spans = [(s, earlier if s.start_s < begin_s else "") for s in log.plan.assignments if s.arm == arm]
         spans += [(each, out if each.kind == "fault" else failed) for each in log.plan.outages if each.arm == arm]
         spans += [(each, paused) for each in log.plan.breaks if each.arm == arm]
+        kept = [(halt, why) for why, halt in halts.items() if halt.arm in ("", arm)]
         free = (at_s >= begin_s) & (at_s < end_s)
-        for span, why in spans:
-            time_s[why] += max(0.0, min(span.end_s, end_s) - max(span.start_s, begin_s))
+        for span, why in [*kept, *spans]:
+            halted_s = 0.0 if why in halts else sum(_common_s(begin_s, end_s, span, halt) for halt, _ in kept)
+            time_s[why] += _common_s(begin_s, end_s, span) - halted_s
             free &= (at_s < span.start_s) | (at_s >= span.end_s)
         peak_c = np.fmax.reduce(log.readings.temp_c[free, log.arms.index(arm)], axis=-1, initial=-math.inf)
         time_s[hot] += step_s * float((peak_c >= log.limits.warning_c).sum())
@@ -347,24 +366,37 @@ def _arm_time(log: ShiftLog, able: Sequence[str], begin_s: float, end_s: float) 
     return time_s
 
 
+def _common_s(begin_s: float, end_s: float, *spans: JobSpan | Outage | Halt) -> float:
+    """Time that some spans have in common between two times, s."""
+    return max(0.0, min(end_s, *(span.end_s for span in spans)) - max(begin_s, *(span.start_s for span in spans)))
+
+
 MOST_LATE = 50
 ROWS = 300
-"""Most rows of the event table, and of the table of requests."""
+"""Most rows of the event table."""
 BEFORE_S = 5.0
 """A click on an event goes to this time before it."""
 NOTABLE = (
     "fault",
     "failure",
     "contact",
+    "alarm",
+    "pause",
+    "resume",
+    "cancel",
+    "settle",
+    "change",
     "recover",
     "return",
     "break",
     "break_end",
     "warning",
     "torque_warning",
+    "alarm_acknowledged",
+    "alarm_ended",
     "lost",
 )
-"""Event kinds of the event table, most important first; the least important are dropped first."""
+"""Kinds of events and notices of the event table, most important first; the least important are dropped first."""
 MOST_AWARDS = 300
 MOST_OFFERS = 7
 """Other offers that an award shows."""
@@ -393,8 +425,6 @@ def report_html(log: ShiftLog, model: Mapping[str, Any] | None = None) -> str:
     if late := _late_table(log):
         sections.append(Section(key="late", title="Late jobs", tables=(late,)))
     sections += [_event_section(log), *_award_section(log)]
-    if requests := _request_table(card.get("requests") or ()):
-        sections.append(Section(key="requests", title="Requests of people", tables=(requests,)))
     provenance = (("All settings and figures", _provenance(card).html()),)
     sections.append(Section(key="provenance", title="Provenance", details=provenance))
     seed = f" · seed {card['seed']}" if "seed" in card else ""
@@ -527,8 +557,8 @@ def numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _event_section(log: ShiftLog) -> Section:
-    """The notable events by time, how many there are, and which are left out."""
-    notable = [e for e in log.events if e.kind in NOTABLE]
+    """The notable events and notices by time, how many there are, and which are left out."""
+    notable = [e for e in (*log.events, *log.notices) if e.kind in NOTABLE]
     if not notable:
         return Section(key="log", title="Events", sentences=("No fault, no warning, no lost claim.",))
     first = sorted(notable, key=lambda e: (NOTABLE.index(e.kind), e.time_s))
@@ -541,7 +571,7 @@ def _event_section(log: ShiftLog) -> Section:
         )
     listed.sort(key=lambda e: (e.time_s, e.arm, NOTABLE.index(e.kind)))
     table = Table(
-        head=("time", "event", "arm", "job", "reason"),
+        head=("time", "event", "arm", "job", "reason, or who"),
         rows=tuple((clock(e.time_s, log.begin), kind_text(e.kind), e.arm, e.job, e.reason) for e in listed),
         numbers=False,
     )
@@ -550,13 +580,13 @@ def _event_section(log: ShiftLog) -> Section:
     return Section(key="log", title="Events", sentences=tuple(sentences), html=shown)
 
 
-def _before(event: Event) -> Moment:
+def _before(event: Event | Notice) -> Moment:
     return Moment(max(0.0, event.time_s - BEFORE_S), event.arm)
 
 
 def _award_section(log: ShiftLog) -> Iterator[Section]:
     """Why each arm got its job: the offers behind each award; nothing without offers."""
-    awards = [list(group) for _, group in groupby(log.offers, key=lambda o: (o.time_s, o.job))]
+    awards = [list(group) for _, group in groupby(log.known_offers, key=lambda o: (o.time_s, o.job))]
     if not awards:
         return
     rows, moments = list[tuple[str, ...]](), list[Moment]()
@@ -577,14 +607,6 @@ def _award_section(log: ShiftLog) -> Iterator[Section]:
     yield Section(key="awards", title="Why each arm got its job", how=how, details=details)
 
 
-def _request_table(requests: Sequence[Sequence[str]]) -> Table | None:
-    """What people asked of a live fleet, if anything."""
-    rows = tuple(tuple(request) for request in requests[-ROWS:])
-    caption = f"The last {len(rows)} of {len(requests)}." if len(rows) < len(requests) else ""
-    head = ("time", "request", "job or arm", "by")
-    return Table(head=head, rows=rows, caption=caption, numbers=False) if rows else None
-
-
 def _counted(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{counts[kind]} × {kind_text(kind)}" for kind in NOTABLE if counts.get(kind))
 
@@ -593,7 +615,7 @@ def _provenance(run: Mapping[str, Any]) -> Table:
     """Everything else in `run.json`."""
     rows = list[tuple[str, str]]()
     scenario = {f"scenario {k}": v for k, v in run.get("scenario", {}).items() if k not in ("name", "description")}
-    rest = {k: v for k, v in run.items() if k not in ("scenario", "status", "policy", "seed", "requests")}
+    rest = {k: v for k, v in run.items() if k not in ("scenario", "status", "policy", "seed")}
     for key, value in (rest | scenario).items():
         parts = value.items() if isinstance(value, Mapping) else [("", value)]
         rows += [(f"{key} {part}".strip(), value_text(inner)) for part, inner in parts]

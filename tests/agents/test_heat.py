@@ -42,6 +42,14 @@ def action(name: str, seen: Observation) -> int:
     return make_policy(name).act({"arm": seen})["arm"]
 
 
+@pytest.mark.parametrize(("late_min", "claims"), [(95.0, True), (100.5, False)])
+@pytest.mark.parametrize("name", ["wsept", "wsept_ahead", "wsept_local", "bid_price", "bid_price_shared", "auction"])
+def test_no_policy_by_worth_claims_a_job_that_would_end_100_min_late(name: str, late_min: float, claims: bool) -> None:
+    """Tardiness costs 1 % of the value a minute, so then nothing is left; docs/policies.md says so."""
+    late = seen([1.0], [41.0, 41.0], left_s=1e6, due_in_s=np.array([FAST - 60.0 * late_min]))
+    assert (action(name, late) != WAIT) == claims
+
+
 def test_a_sure_fault_costs_the_job_and_the_price() -> None:
     assert action("wsept", seen([4.0], [95.0, 95.0])) == WAIT
     assert action("wsept", seen([4.0], [50.0, 50.0])) == 1

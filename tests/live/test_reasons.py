@@ -10,6 +10,9 @@ from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.rounds import Bidding, reason_to_wait
 from fleet.live.book import JobBook
 from fleet.live.job_rules import why_not_ready
+from fleet.live.journal import JobsAccepted
+from fleet.live.leases import expire
+from tests.live.records import awarded
 
 JOB = JobSpec(name="j", kind="hold", places=("bench",))
 NEAR = PlanQuote(plan=0, space="near", duration_s=10.0)
@@ -104,3 +107,17 @@ def test_an_arm_that_names_another_space_each_time_does_not_flood_the_fleet() ->
             auctioneer.add_quote(Quote("a", each.auction, "", 3.0, "t", 0.0, "idle", 9.0, 1, (), space))
         auctioneer.out.clear()
     assert asked <= 10
+
+
+@pytest.mark.parametrize(
+    ("late_s", "reason"),
+    [
+        (0.1, "'arm_0' did not renew its lease."),
+        (60.0, "The lease of 'arm_0' ended while nobody could renew it: the process that awards was stopped."),
+    ],
+)
+def test_a_lease_that_ends_while_the_auctioneer_is_stopped_is_not_blamed_on_its_arm(late_s: float, reason: str) -> None:
+    book = JobBook().replay([JobsAccepted((JOB,)), awarded("w:j", "j")])
+    book.attach(lambda *_: None, 100.0)
+    assert expire(book, 100.0 + late_s, 5.0)
+    assert book.status_of(book.jobs["j"]).reason == reason

@@ -28,17 +28,18 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
 from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import Alarm, Cancel, Change, ControlRequest, Operation, Pause, Settle
+from fleet.bus.protocol.operator import Alarm, Cancel, Change, ControlRequest, Operation, Pause, Resume, Settle
 from fleet.bus.router import Router
 from fleet.errors import FleetError
 from fleet.events import Event
+from fleet.live.job_rules import EXPIRED
 from fleet.robot import ThermalLimits
 from scenarios.cli.main import main
 from scenarios.live.recorder import Recorder, lock_folder, record
 from scenarios.live.recording import CARD, alarms_of, open_messages, part_files, read_card, read_parts, replay
 from scenarios.live.recording_report import heat_use, open_recording, order_events
-from scenarios.run.records import ShiftLog, schedule
-from scenarios.show.run_page import report_html
+from scenarios.run.records import JobRecord, ShiftLog, schedule
+from scenarios.show.run_page import late_jobs, lateness_text, report_html, verdict
 from tests.profiles import examples
 from tests.waiting import PATIENCE_S, serve_until, wait_until
 
@@ -135,6 +136,17 @@ def test_a_new_epoch_in_the_same_folder_is_no_repetition(tmp_path):
         again.add("", message)
     again.write(status="finished")
     assert sorted(map(repr, open_messages(tmp_path))) == sorted(map(repr, sent))
+    assert read_parts(tmp_path, "gaps").num_rows == 0
+
+
+def test_a_repeated_event_of_a_later_time_is_no_restart(tmp_path):
+    """An arm numbers its arrival at home before the finish, which was earlier; a cache repeats both."""
+    recorder = Recorder.open(tmp_path, "f")
+    sent = [replace(event("a", number), time_s=time_s) for number, time_s in ((1, 10.0), (2, 30.0), (3, 20.0))]
+    for message in (*sent, *sent):
+        recorder.add("a", message)
+    recorder.write(status="finished")
+    assert read_parts(tmp_path, "events")["number"].to_pylist() == [1, 3, 2]
     assert read_parts(tmp_path, "gaps").num_rows == 0
 
 
@@ -424,22 +436,120 @@ def test_a_report_names_missing_messages_and_returned_jobs(tmp_path):
     assert "3 recorded, 2 missing" in html
 
 
-def test_a_report_names_who_asked_for_what(tmp_path):
-    recorder = record_events(tmp_path / "r", LOG[:1])
+def listed_events(html):
+    """Cells of the list of events."""
+    rows = re.findall(r"<tr class=.*?</tr>", html.split("<h2>Events")[1].split("</table>")[0])
+    return [re.findall(r"<td>(.*?)</td>", row) for row in rows]
+
+
+def test_a_report_lists_alarms_and_requests_among_the_events_and_names_who(tmp_path):
+    recorder = record_events(tmp_path / "r", LOG[:5])
     recorder.add("boss", Result("boss", 0, 0.0, JobStatus("a-1", "waiting"), by="bob"))
-    actions = (Change("a-1", due_s=900.0), Cancel("b-1"), Pause(), Settle("c-1", "redo"))
+    actions = (Change("a-1", due_s=900.0, value=2.0), Cancel("b-1"), Pause(), Settle("c-1", "redo"), Resume("arm_0"))
     for number, action in enumerate(actions):
-        recorder.add("boss", Operation("boss", 60.0 * number, ControlRequest(str(number), action, "<ann>"), number))
+        recorder.add("boss", Operation("boss", 30.0 * number, ControlRequest(str(number), action, "<ann>"), number))
+    hot = Alarm("m", 1, 45.0, "7d1f", "fault", "arm_0 is faulted.", "arm_0", began_s=44.0)
+    seen = replace(hot, number=2, time_s=70.0, by="cleo", acknowledged="2026-01-31T09:00:00Z")
+    for alarm in (hot, seen, replace(seen, number=3, time_s=95.0, ended_s=88.0)):
+        recorder.add("m", alarm)
     recorder.write(status="finished")
     html = open_recording(tmp_path / "r").page()
-    rows = re.findall(r"<tr>(.*?)</tr>", html.split("Requests of people</h2>")[1].split("</table>")[0])
-    assert [re.findall(r"<td>(.*?)</td>", row) for row in rows[1:]] == [
-        ["0:00:00", "change due 900.0", "a-1", "&lt;ann&gt;"],
-        ["0:01:00", "cancel", "b-1", "&lt;ann&gt;"],
-        ["0:02:00", "pause", "all arms", "&lt;ann&gt;"],
-        ["0:03:00", "settle redo", "c-1", "&lt;ann&gt;"],
+    assert listed_events(html) == [
+        ["0:00:00", "change", "", "a-1", "due at 0:15:00, value 2, by &lt;ann&gt;"],
+        ["0:00:30", "cancel", "", "b-1", "by &lt;ann&gt;"],
+        ["0:00:40", "warning", "arm_0", "a-1", "joint 2 passed 60 °C"],
+        ["0:00:44", "alarm", "arm_0", "", "arm_0 is faulted."],
+        ["0:01:00", "pause", "all arms", "", "by &lt;ann&gt;"],
+        ["0:01:10", "alarm acknowledged", "arm_0", "", "by cleo: arm_0 is faulted."],
+        ["0:01:28", "alarm ended", "arm_0", "", "arm_0 is faulted."],
+        ["0:01:30", "settle", "", "c-1", "as redo, by &lt;ann&gt;"],
+        ["0:02:00", "resume", "arm_0", "", "by &lt;ann&gt;"],
     ]
     assert "<td>jobs submitted by bob</td><td>1</td>" in html
+
+
+def test_late_jobs_of_a_recording_and_of_a_run_are_counted_alike(tmp_path):
+    """Second method: the same jobs as records of a run. What was due after the end of the shift is not late."""
+    states = {
+        "a-1": "awarded",
+        "b-1": "finished",
+        "open-1": "unfinished",
+        "after-1": "unfinished",
+        "gone-1": "given_up",
+    }
+    due_s = {"a-1": 70.0, "b-1": 18.0, "open-1": 60.0, "after-1": 95.0, "gone-1": 50.0, "stop-1": 40.0}
+    recorder = record_events(tmp_path / "r", LOG)
+    for number, (job, state) in enumerate((states | {"stop-1": "cancelled"}).items()):
+        reason = EXPIRED if job == "gone-1" else ""
+        status = JobStatus(
+            job, state, reason=reason, due_s=due_s[job], release_s=5.0, shift_ended=state == "unfinished"
+        )
+        recorder.add("boss", Result("boss", number, 90.0, status))
+    recorder.write(status="finished")
+    live = open_recording(tmp_path / "r")
+    more = {"release_s": 5.0, "finished_s": None, "value": 1.0, "payload_kg": 0.0, "cycles": 1}
+    alike = {"awarded": "running", "unfinished": "waiting", "given_up": "expired"}
+    jobs = [
+        JobRecord(job=job, state=alike.get(state, state), due_s=due_s[job], **more) for job, state in states.items()
+    ]
+    run = ShiftLog(card={}, arms=ARMS, limits=live.limits, readings=live.readings, events=LOG, jobs=tuple(jobs))
+    both = (late_jobs(live), late_jobs(dataclasses.replace(run, ended_s=90.0)))
+    assert [[(late.job, late.late_s) for late in each] for each in both] == 2 * [
+        [("open-1", 30.0), ("a-1", 20.0), ("b-1", 12.0), ("gone-1", 40.0)]
+    ]
+    assert (live.card["metrics"]["expired"], live.card["metrics"]["given_up"]) == (1, 0)
+
+
+def record_wait(folder, late_s, alarms=(), actions=(), before=()):
+    """A recording of a job that is due at 50 s, waits for its only arm from 10 s to 80 s, and is finished at 90 s."""
+    log = (Event(time_s=80.0, kind="award", arm="arm_0", job="a-1"),
+           Event(time_s=90.0, kind="finish", arm="arm_0", job="a-1", value=late_s))  # fmt: skip
+    recorder = record_events(folder, (*before, *log))
+    offer = structs.replace(EXAMPLES[Result].offers[0], arm="arm_0")
+    award = JobStatus("a-1", "awarded", arm="arm_0", due_s=50.0, release_s=10.0)
+    recorder.add("boss", Result("boss", 0, 80.0, award, offers=(offer,)))
+    for alarm in alarms:
+        recorder.add("m", alarm)
+    for number, (time_s, action) in enumerate(actions):
+        recorder.add("boss", Operation("boss", time_s, ControlRequest(str(number), action, "ann"), number))
+    recorder.write(status="finished")
+    log = open_recording(folder)
+    return lateness_text(log, late_jobs(log))
+
+
+def test_a_job_that_waits_while_nobody_replies_is_late_by_that_and_not_by_its_arm(tmp_path):
+    silent = Alarm("m", 1, 35.0, "7d1f", "silent", "boss does not reply.", "boss", began_s=20.0, ended_s=75.0)
+    waits = "a-1 finished 40 s late: "
+    assert record_wait(tmp_path / "1", 40.0, [silent]) == f"{waits}boss did not reply from 0:00:20 to 0:01:15."
+    assert record_wait(tmp_path / "2", 40.0, [replace(silent, ended_s=None)]) == (
+        f"{waits}boss did not reply from 0:00:20 to the end."
+    )
+    busy = [
+        Event(time_s=time_s, kind=kind, arm="arm_0", job="x-1", value=0.0)
+        for time_s, kind in ((5.0, "award"), (79.0, "finish"), (79.5, "home"))
+    ]
+    assert record_wait(tmp_path / "6", 40.0, [silent], before=busy).startswith(f"{waits}boss did not reply")
+    short = replace(silent, began_s=45.0, ended_s=60.0)
+    assert record_wait(tmp_path / "3", 40.0, [short]).startswith(f"{waits}arm_0 was idle")
+    paused = [(15.0, Pause("arm_0")), (78.0, Resume())]
+    assert record_wait(tmp_path / "4", 40.0, actions=paused) == (
+        f"{waits}arm_0 was paused by ann from 0:00:15 to 0:01:18."
+    )
+    other = [(15.0, Pause("arm_1")), (78.0, Resume())]
+    assert record_wait(tmp_path / "5", 40.0, actions=other).startswith(f"{waits}arm_0 was idle")
+
+
+def test_a_returned_job_is_late_by_the_reason_of_its_return(tmp_path):
+    recorder = record_events(tmp_path / "r", LOG[:1])
+    steps = (("awarded", "arm_0", ""), ("waiting", "", "Its arm was paused by 'ann'."))
+    for number, (state, arm, reason) in enumerate(steps):
+        status = JobStatus("a-1", state, arm=arm, reason=reason, due_s=30.0, release_s=0.0)
+        recorder.add("boss", Result("boss", number, 70.0 * number, status))
+    recorder.add("m", Alarm("m", 1, 35.0, "7d1f", "silent", "boss does not reply.", "boss", began_s=20.0, ended_s=65.0))
+    recorder.write(status="finished")
+    log = open_recording(tmp_path / "r")
+    assert "boss did not reply from 0:00:20 to 0:01:05: no job was awarded." in verdict(log).sentences
+    assert lateness_text(log, late_jobs(log)).endswith("arm_0 returned it at 0:01:10: its arm was paused by 'ann'.")
 
 
 def test_the_report_of_two_epochs_shows_the_last_one(tmp_path):

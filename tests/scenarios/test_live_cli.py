@@ -41,7 +41,7 @@ from fleet.live.job_client import batches
 from scenarios.live import auctioneer as live_auction
 from scenarios.live.arm import ambient_of, replayed_arm, wait_for_name
 from scenarios.live.auctioneer import job_spec, refuse_other_way, scenario_jobs
-from scenarios.live.recorder import Recorder
+from scenarios.live.fleet_processes import CARD
 from scenarios.live.requests import read_jobs
 from scenarios.prepare.fleet import make_env, prepare, prepare_arm
 from scenarios.spec.load import load
@@ -383,13 +383,25 @@ def test_up_refuses_a_webhook_that_cannot_be_sent_before_it_plans(thermofleet, t
     assert says in " ".join(err.split())
 
 
-def test_up_refuses_the_folder_of_another_fleet(thermofleet, tmp_path):
-    (tmp_path / "recording").mkdir()
-    Recorder.open(tmp_path / "recording", "night")
-    code, _, err = thermofleet("up", "quickstart", "--out", tmp_path)
+@pytest.mark.parametrize(
+    ("fleet", "options", "says"),
+    [
+        ("night", (), "is of fleet 'night', not of 'quickstart': give another --out"),
+        ("quickstart", (), "is of a fleet with --seed 3 (got 0): give --seed 3 to continue it, or another --out"),
+        ("quickstart", ("--seed", "3"), "cannot be used"),  # the next check
+        ("quickstart", ("--new-epoch",), "cannot be used"),
+    ],
+)
+def test_up_refuses_the_folder_of_another_fleet_or_seed(thermofleet, tmp_path, fleet, options, says):
+    (tmp_path / CARD).write_text(json.dumps({"fleet": fleet, "seed": 3}))
+    with socket.socket() as held:
+        held.bind(("127.0.0.1", 0))
+        held.listen()
+        port = held.getsockname()[1]
+        code, _, err = thermofleet("up", "quickstart", "--out", tmp_path, "--port", port, *options)
     assert code == 2
-    assert "is of fleet 'night', not of 'quickstart': give another --out" in " ".join(err.split())
-    assert [each.name for each in tmp_path.iterdir()] == ["recording"]
+    assert says in " ".join(err.split())
+    assert [each.name for each in tmp_path.iterdir()] == [CARD]
 
 
 def test_up_forks_its_parts_after_what_it_checks_and_imports(tmp_path):
@@ -403,13 +415,12 @@ from fleet.live.supervisor import _may_fork
 from scenarios.live import fleet_processes as up
 os.environ["THERMOFLEET_WEBHOOK_SECRET"] = 16 * "x"
 up._check_page(None, ["http://127.0.0.1:9/"])
-up._refuse_other_fleet(Path({str(tmp_path)!r}), "quickstart")
+up.refuse_other_fleet(Path({str(tmp_path)!r}), up.FleetCard("quickstart", 0))
 for module in (*up.SHARED, *up.SHARED_BY_PAGE):
     import_module(module)
 print(_may_fork())
 """
-    (tmp_path / "recording").mkdir()
-    Recorder.open(tmp_path / "recording", "quickstart")
+    (tmp_path / CARD).write_text('{"fleet": "quickstart", "seed": 0}')
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=False)
     assert done.stdout == "True\n", done.stderr
 
@@ -459,10 +470,11 @@ def test_submitted_jobs_survive_a_kill(endpoint, tmp_path, thermofleet):
         assert code == 1
         assert out.startswith("a: accepted\nb: refused: No place 'moon' in this cell. Places: ")
         table = tmp_path / "jobs.csv"
-        table.write_text("name,kind,places,after\nc,hold,moon,\nd,hold,belt,\ne,hold,mars,\n")
+        table.write_text("name,kind,places,after,payload\nc,hold,moon,,\nd,hold,belt,,heavy\ne,hold,mars,,\n")
         code, out, err = thermofleet("job", "submit", table, *at)
         assert (code, out) == (2, "")
-        assert f"{table} has 2 faults:\n  row 2, column places: no place 'moon'. Allowed: " in err
+        assert f"{table} has 3 faults:\n  row 2, column places: no place 'moon'. Allowed: " in err
+        assert "row 3, column payload: expected a number (got 'heavy')." in err
         assert "row 4, column places: no place 'mars'" in err
         table.write_text("name,kind,places,after\na,hold,belt,\nd,hold,belt,\ne,hold,belt,no/one\n")
         code, out, _ = thermofleet("job", "submit", table, *at)
@@ -610,8 +622,11 @@ def test_a_list_of_jobs_has_a_line_for_each_and_ages_since_their_acceptance(endp
         _, new, planned = thermofleet(*listed)[1].splitlines()  # in a pipe
         monkeypatch.setenv("COLUMNS", "80")
         _, *narrow = thermofleet(*listed)[1].splitlines()
+        monkeypatch.setenv("COLUMNS", "20")
+        sentence, _ = thermofleet(*listed)[1].splitlines()  # wrapped by a terminal only
     assert " ".join(new.split()) == f"new waiting 0 of 12 2 min 0:50:00, 10 min late {why}"
     assert " ".join(planned.split()) == f"planned waiting 0 of 12 10 min {why}"
+    assert sentence == f"new: state waiting, cycles 0 of 12, age 2 min, due 0:50:00, 10 min late, reason {why}"
     assert [line.split()[:2] for line in narrow] == [["new", "waiting"], ["planned", "waiting"]]
     assert all(len(line) <= 80 and "It waits until the_arm" in line for line in narrow)
 

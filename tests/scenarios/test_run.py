@@ -326,7 +326,7 @@ def test_a_recording_has_what_arms_published_and_says_what_is_missing(tmp_path: 
     recorder.add("a", State(arm="a", tick=0, time_s=0.0, mode="idle", temp_c=(), headroom_k=0.0))
     for number, (kind, reason) in enumerate(log):
         recorder.add("a", ArmEvent(arm="a", number=number, time_s=10.0 * number, kind=kind, job="j", reason=reason))
-    status = JobStatus(job="j", state="awarded", arm="a", value=2.0)
+    status = JobStatus(job="j", state="awarded", arm="a", value=2.0, release_s=5.0, due_s=3725.0)
     for number, time_s in enumerate((1.0, 21.0)):
         quoted = PlanQuote(difficulty=time_s, p_saturation=0.1, duration_s=60.0)
         offers = (ArmOffer("a", "idle", True, quoted), ArmOffer("b", "working", False))
@@ -341,6 +341,7 @@ def test_a_recording_has_what_arms_published_and_says_what_is_missing(tmp_path: 
         ("b", False, False, None),
     ]
     assert (thread.job["value"], thread.code["hash"]) == (2.0, NOT_RECORDED)
+    assert "state awarded, release 0:00:05, due 1:02:05, value 2" in dict(thread_table(thread).rows)["job"]
     assert json.loads(json_text(thread.as_json()))["event"]["kind"] == thread.event.kind
 
 

@@ -148,13 +148,13 @@ class Alarm(FiniteStruct, frozen=True):
     time_s: Number
     """Fleet time of this change."""
     alarm: Name
-    """Unique name of the alarm."""
+    """Name of the alarm: the same for every monitor, and again when it comes back after its end."""
     kind: Name
     """What is wrong, for example `fault`, `sensor`, `given_up` or `no_progress`."""
     what: str
     """A sentence."""
     subject: str = ""
-    """Arm or job; "" for the fleet."""
+    """Arm, job or other thing; "" for the fleet."""
     began_s: Number = 0.0
     """Fleet time at which it began."""
     ended_s: Number | None = None

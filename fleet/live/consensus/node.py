@@ -250,6 +250,8 @@ class ConsensusNode(JobDesk):
         self._declare_desk(link)
         link.subscribe(keys.of_every_arm(fleet, "bid"), Bid, self._apply_bid, history=True)
         link.subscribe(keys.of_every_arm(fleet, "state"), State, self.participant.apply_state)
+        self._at_start = link.tokens(keys.of_every_arm(fleet, "alive"), timeout_s=REPLY_S)
+        self._listened_s = time.monotonic() + LISTEN_S
         link.watch_tokens(keys.of_every_arm(fleet, "alive"), self._apply_token)
 
     def _apply_bid(self, arm: str, bid: Bid) -> None:
@@ -299,7 +301,9 @@ class ConsensusNode(JobDesk):
         Raises:
             AnotherReplies: another arm does.
         """
-        if not self._begun or self._name != min(self._tokens & self.participant.granter.roster, default=self._name):
+        # The bid of a peer may begin the fleet's time here before the tokens arrive.
+        present = self._tokens | (self._at_start if time.monotonic() < self._listened_s else frozenset[str]())
+        if not self._begun or self._name != min(present & self.participant.granter.roster, default=self._name):
             raise AnotherReplies
 
     @property

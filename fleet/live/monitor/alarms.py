@@ -1,8 +1,8 @@
 """Alarms of a fleet: what lasts of the findings of `fleet.live.monitor.health`, and who has acknowledged it."""
 
+import hashlib
 import math
-import secrets
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, MutableMapping, Sequence
 from datetime import UTC, datetime
 
 from msgspec.structs import replace
@@ -22,59 +22,83 @@ HOLD_S = 5.0
 """Real seconds without the finding after which an alarm ends: a finding that comes and goes raises one alarm."""
 
 
+OF_FLEET = ("no_progress", "webhook")
+"""Kinds of alarms whose subject is neither arm nor job: they end with their finding, whoever is heard."""
+
+
+def alarm_name(kind: str, subject: str) -> str:
+    """Name of an alarm, the same for every monitor: two that find the same raise one alarm."""
+    return hashlib.sha256(f"{kind} {subject}".encode()).hexdigest()[:16]
+
+
 class AlarmList:
-    """The alarms that one monitor raises. Without clock and I/O, and of bounded size.
+    """The alarms that one monitor raises, ends and acknowledges. Without clock and I/O, and of bounded size.
 
     Attributes:
-        alarms: By name, the most recently changed last.
+        alarms: By name, the most recently changed last; those of other monitors too.
     """
 
-    def __init__(self, monitor: str, kept: Iterable[Alarm] = ()) -> None:
-        """Begin with the alarms of a recording, in the order of their messages."""
-        self.monitor, self._number = monitor, 0
-        self.alarms: dict[str, Alarm] = {}
-        self._lasting: dict[tuple[str, str], tuple[str, float]] = {}
-        """Name of the alarm, and when the finding was last there, real s, by kind and subject."""
-        for alarm in kept:
-            self._number = max(self._number, alarm.number)
-            self._keep(alarm)
-        for alarm in self.alarms.values():
+    def __init__(self, monitor: str, alarms: MutableMapping[str, Alarm], kept: Sequence[Alarm] = ()) -> None:
+        """Begin with the alarms of a recording, in the order of their messages.
+
+        Args:
+            alarms: Keeps the last message of every alarm; whoever receives those of other monitors adds them.
+        """
+        self.monitor, self.alarms = monitor, alarms
+        self._found_s: dict[str, float] = {}
+        """Real second at which this monitor last had the finding of an alarm, by name; of those that it may end."""
+        self._number = max((alarm.number for alarm in kept if alarm.monitor == monitor), default=0)
+        for name, alarm in {alarm.alarm: alarm for alarm in kept}.items():
+            if alarm.monitor == monitor:
+                self.alarms[name] = alarm
+            else:
+                self._change(alarm, alarm.time_s)
             if alarm.ended_s is None:
-                self._lasting[alarm.kind, alarm.subject] = alarm.alarm, math.inf
+                self._found_s[name] = math.inf
 
     def update(
-        self, findings: Sequence[Finding], time_s: float, real_s: float, heard: Container[str] | None = None
+        self,
+        findings: Sequence[Finding],
+        time_s: float,
+        real_s: float,
+        heard: Container[str] | None = None,
+        speed: float = 1.0,
     ) -> list[Alarm]:
         """Begin and end alarms by the present findings; return those that have changed.
+
+        A monitor ends only alarms whose finding it has had itself, or that are of the recording.
 
         Args:
             heard: Arms and jobs of which the monitor knows: an alarm of another one lasts until a person has seen it,
                 for example that of an arm which fell silent before the monitor began. None: it knows of all.
             time_s: Fleet time.
             real_s: Real seconds of a monotonic clock.
+            speed: Fleet seconds per real second.
         """
         changed: list[Alarm] = []
         for finding in findings:
-            if not finding.kind:
+            name = alarm_name(finding.kind, finding.subject)
+            if not finding.kind or (name not in self._found_s and len(self._found_s) >= MAX_ALARMS // 2):
                 continue
-            key = finding.kind, finding.subject
-            name, _ = self._lasting.get(key, ("", 0.0))
-            if not name and len(self._lasting) < MAX_ALARMS // 2:
-                name = secrets.token_hex(4)
+            self._found_s[name] = real_s
+            if name not in self.alarms or self.alarms[name].ended_s is not None:
                 what = LASTING.get(finding.kind, finding.what).format(finding.subject)
-                alarm = Alarm(self.monitor, 0, time_s, name, finding.kind, what, finding.subject, time_s)
+                began_s = max(0.0, time_s - speed * finding.since_s)
+                alarm = Alarm(self.monitor, 0, time_s, name, finding.kind, what, finding.subject, began_s)
                 changed.append(self._change(alarm, time_s))
-            if name:
-                self._lasting[key] = name, real_s
-        for key, (name, seen_s) in list(self._lasting.items()):
-            seen_s = min(seen_s, real_s)  # those of a recording were last seen now
-            unheard = key[1] and heard is not None and key[1] not in heard
-            if unheard and not self.alarms[name].by:
-                seen_s = real_s
-            self._lasting[key] = name, seen_s
-            if real_s - seen_s > HOLD_S:
-                del self._lasting[key]
-                changed.append(self._change(replace(self.alarms[name], ended_s=time_s), time_s))
+        for name, found_s in list(self._found_s.items()):
+            alarm = self.alarms.get(name)
+            if alarm is None or alarm.ended_s is not None:
+                del self._found_s[name]  # another monitor has ended it
+                continue
+            of_participant = alarm.kind not in OF_FLEET and bool(alarm.subject)
+            if of_participant and heard is not None and alarm.subject not in heard and not alarm.by:
+                found_s = real_s
+            self._found_s[name] = min(found_s, real_s)  # those of a recording were last found now
+            if real_s - found_s > HOLD_S:
+                del self._found_s[name]
+                ended_s = max(alarm.began_s, time_s - speed * (real_s - found_s))
+                changed.append(self._change(replace(alarm, ended_s=ended_s), time_s))
         return changed
 
     def acknowledge(self, name: str, by: str, time_s: float, now: datetime) -> Alarm:
@@ -96,13 +120,5 @@ class AlarmList:
     def _change(self, alarm: Alarm, time_s: float) -> Alarm:
         self._number += 1
         changed = replace(alarm, monitor=self.monitor, number=self._number, time_s=time_s)
-        self._keep(changed)
+        self.alarms[alarm.alarm] = changed
         return changed
-
-    def _keep(self, alarm: Alarm) -> None:
-        """Keep the state of an alarm; of too many, the oldest that does not last is dropped."""
-        self.alarms.pop(alarm.alarm, None)
-        self.alarms[alarm.alarm] = alarm
-        if len(self.alarms) > MAX_ALARMS:
-            ended = (name for name, each in self.alarms.items() if each.ended_s is not None)
-            del self.alarms[next(ended, next(iter(self.alarms)))]

@@ -10,14 +10,14 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from itertools import takewhile
 from typing import Self, TypeVar
 
 import msgspec
-from msgspec.structs import replace
 
 from fleet.bus.client import BusClient, Replies, replier
 from fleet.bus.protocol import keys
@@ -26,7 +26,7 @@ from fleet.bus.protocol.messages import encode
 from fleet.bus.protocol.operator import Alarm
 from fleet.errors import BusError, Refused
 from fleet.live.monitor.alarms import AlarmList
-from fleet.live.monitor.health import check_fleet
+from fleet.live.monitor.health import Finding, check_fleet
 from fleet.live.monitor.snapshot import FRESH_S, MAX_JOBS, FleetListener, FleetSnapshot, Recent, Role
 
 _LOG = logging.getLogger(__name__)
@@ -39,7 +39,7 @@ REPLY_S, QUOTE_S, TURN_S = 5.0, 1.0, 0.2
 CHECK_S = 1.0
 """Real seconds between two checks for alarms."""
 MONITOR = "gateway"
-"""Name under which alarms are published without a certificate, whose name would be used."""
+"""Begin of the name under which alarms are published without a certificate, whose name would be used."""
 HISTORY = 1024
 """Events and results that are kept for slow readers, and for those that reconnect."""
 MAX_NAMES = 4096
@@ -110,15 +110,19 @@ class AsyncBridge:
         link: BusClient,
         on_message: Callable[[], None],
         *,
-        kept: Iterable[Alarm] = (),
+        monitor: str = MONITOR,
+        kept: Sequence[Alarm] = (),
         on_alarm: Callable[[Alarm], None] = lambda alarm: None,
+        more_findings: Callable[[], Sequence[Finding]] = tuple,
     ) -> None:
         """Prepare; `link` is open.
 
         Args:
             on_message: Called for every message in `feed`, on the event loop.
+            monitor: Name under which alarms are published if `link` has no certificate, whose name is used.
             kept: Alarms of a recording, which are published again.
-            on_alarm: Called for every change of an alarm, on the event loop.
+            on_alarm: Called for every change of an alarm by any monitor, on the event loop.
+            more_findings: Findings beside those of the fleet, which raise alarms too; called on the thread of the bus.
         """
         self.feed = EventFeed()
         self.fleet = link.fleet
@@ -127,13 +131,15 @@ class AsyncBridge:
         self._thread = threading.Thread(target=self._serve, name="bus", daemon=True)
         self._listener = FleetListener(link, on_message=self._message, on_presence=self._presence)
         self._loop: asyncio.AbstractEventLoop | None = None
-        name = link.participant or MONITOR
-        self._alarms, self._on_alarm = AlarmList(name, kept), on_alarm
+        name = link.participant or monitor
+        self._alarms, self._on_alarm = AlarmList(name, self._listener.view.alarms, kept), on_alarm
+        self._more_findings = more_findings
         self._publish = link.publisher(keys.build(self.fleet, "monitor", "alarm", name), Alarm)
         self._check_s = time.monotonic() + FRESH_S  # by then it has heard from everybody who is there
         self._earlier = deque[FleetSnapshot](maxlen=3)
+        self._told = {each.alarm: (each.ended_s is None, each.by) for each in self._alarms.alarms.values()}
         for alarm in self._alarms.alarms.values():
-            self._tell(replace(alarm, monitor=name))
+            self._publish(alarm)
 
     async def __aenter__(self) -> Self:
         self._loop = asyncio.get_running_loop()
@@ -166,12 +172,13 @@ class AsyncBridge:
         """Note that a person has seen an alarm. Raises Refused as `AlarmList.acknowledge`."""
 
         def acknowledge(done: Callable[[Alarm | Refused], None]) -> None:
+            now = self._listener.view.snapshot(time.monotonic(), 0)
             try:
-                changed = self._alarms.acknowledge(alarm, by, self._time_s(), datetime.now(UTC))
+                changed = self._alarms.acknowledge(alarm, by, fleet_time_s(now), datetime.now(UTC))
             except Refused as refused:
                 done(refused)
             else:
-                self._change(changed)
+                self._publish(changed)
                 done(changed)
 
         answer = await self._on_bus(acknowledge)
@@ -224,22 +231,14 @@ class AsyncBridge:
         self._earlier.append(now)
         heard = {each.arm for each in now.arms} | {each.job for each in now.jobs}
         heard |= {each.auctioneer for each in now.auctioneers}
-        for alarm in self._alarms.update(findings, self._time_s(), real_s, heard):
-            self._change(alarm)
-
-    def _change(self, alarm: Alarm) -> None:
-        self._tell(alarm)
-        self._on_loop(lambda: self._on_alarm(alarm))
-
-    def _tell(self, alarm: Alarm) -> None:
-        """Publish the state of an alarm, and show it here, also if the router forwards it to nobody."""
-        self._publish(alarm)
-        self._listener.view.update(alarm.monitor, alarm, time.monotonic())
-
-    def _time_s(self) -> float:
-        """Fleet time, by the last message of any arm."""
-        last = self._earlier[-1].arms if self._earlier else ()
-        return max((arm.time_s for arm in last if arm.time_s is not None), default=0.0)
+        findings += self._more_findings()
+        for alarm in self._alarms.update(findings, fleet_time_s(now), real_s, heard, now.speed or 1.0):
+            self._publish(alarm)
+        alarms = self._alarms.alarms
+        told, self._told = self._told, {name: (each.ended_s is None, each.by) for name, each in alarms.items()}
+        for name, state in self._told.items():
+            if state != told.get(name, state if alarms[name].ended_s is not None else None):
+                self._on_loop(partial(self._on_alarm, alarms[name]))
 
     def _message(self, topic: str, name: str, message: msgspec.Struct) -> None:
         self._on_loop(lambda: self._add(topic, name, encode(message)))
@@ -259,3 +258,8 @@ class AsyncBridge:
             self._loop.call_soon_threadsafe(call)
         except RuntimeError:
             _LOG.debug("The event loop has ended.")
+
+
+def fleet_time_s(fleet: FleetSnapshot) -> float:
+    """Fleet time, by the last message of any arm."""
+    return max((arm.time_s for arm in fleet.arms if arm.time_s is not None), default=0.0)

@@ -1,12 +1,12 @@
 """Health of a fleet: findings from a snapshot, clock replies and malformed messages."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from shlex import quote
 from statistics import median
-from typing import Literal
+from typing import Literal, get_args
 
 import msgspec
 
@@ -21,6 +21,8 @@ REASONS = {
     "is in use": "place", "has a job": "busy",
 }  # fmt: skip
 """Class of the reason of a waiting job, by a part of it; the first part that it has counts."""
+OTHER = "other"
+"""Class of any other reason."""
 EXPECTED = ("release", "predecessor", "paused", "queue", "break", "planning", "hot", "faulted")
 """Classes of jobs that wait in order."""
 MOST_REASONS = 5
@@ -31,16 +33,22 @@ OFFSET_S, SLOW_S = 1.0, 0.1
 """Real seconds: clock offsets and round trips above these are findings."""
 
 
+AlarmKind = Literal["fault", "sensor", "absent", "silent", "given_up", "unfinished", "no_progress", "space", "webhook"]
+ALARM_KINDS: tuple[AlarmKind, ...] = get_args(AlarmKind)
+
+
 class Finding(msgspec.Struct, frozen=True):
     """One statement about the fleet."""
 
     level: Literal["fault", "warning", "note"]
     """fault: the fleet cannot work; warning: it works, but needs attention; note: it is as it should be."""
     what: str
-    kind: str = ""
+    kind: AlarmKind | Literal[""] = ""
     """Kind of the alarm that it raises; "" for none."""
     subject: str = ""
-    """Arm or job of the alarm; "" for the fleet. An alarm lasts while there is a finding of its kind and subject."""
+    """Of the alarm, for example an arm or a job; it lasts while there is a finding of its kind and subject."""
+    since_s: float = 0.0
+    """Real seconds for which it has been so before it was found."""
 
 
 @dataclass(frozen=True)
@@ -102,10 +110,15 @@ def check_health(
     trips_s = [probe.answered_s - probe.asked_s for probe in probes]
     clock = best_clock(probes)
     offsets_s = {arm.arm: offset_s(arm, now_s, clock) for arm in fleet.arms if arm.time_s is not None} if clock else {}
+    common_s = common_offset_s(offsets_s.values())
     findings = [
         *check_auctioneers(fleet, probes, auctioneer),
-        *check_fleet(fleet, earlier, offsets_s),
+        *check_fleet(fleet, earlier, {a: off_s for a, off_s in offsets_s.items() if abs(off_s - common_s) > OFFSET_S}),
     ]
+    if abs(common_s) > OFFSET_S:
+        off = f"Every arm is {abs(common_s):.1f} s or more {'ahead of' if common_s > 0 else 'behind'} fleet time."
+        why = "After a restart of the auctioneer that ends within 2 min; otherwise its machine may be overloaded."
+        findings.append(Finding("warning", f"{off} {why}"))
     if missing := [name for name in expected if name not in {arm.arm for arm in fleet.arms if arm.token}]:
         findings.append(Finding("fault", f"Not present: {', '.join(missing)}."))
     if not any(arm.present for arm in fleet.arms):
@@ -139,7 +152,7 @@ def check_fleet(
 
     Args:
         earlier: As in `check_health`.
-        offsets_s: As in a report.
+        offsets_s: As in a report, of the arms whose offset is to be checked.
     """
     arms = (finding for arm in fleet.arms for finding in check_arm(arm, offsets_s.get(arm.arm)))
     return [*arms, *check_replies(fleet), *check_jobs(fleet), *check_progress(fleet, earlier), *check_space(fleet)]
@@ -152,17 +165,20 @@ def check_replies(fleet: FleetSnapshot) -> list[Finding]:
     if not last or ages_s[last] <= SILENT_S or not any(arm.present for arm in fleet.arms):
         return []
     silent = f"{last} has not replied for {ages_s[last]:.0f} s: its process hangs or has ended, and no job is awarded."
-    return [Finding("fault", silent, "silent", last)]
+    return [Finding("fault", silent, "silent", last, ages_s[last])]
 
 
 def check_jobs(fleet: FleetSnapshot) -> list[Finding]:
-    """Check that no job is unfinished, except by the end of the shift, or abandoned."""
-    words = {"unfinished": "is unfinished, so its outcome is unknown", "given_up": "is abandoned"}
-    return [
-        Finding("warning", f"'{job.job}' {words[job.state]}: {job.reason or 'no reason'}", job.state, job.job)
-        for job in fleet.jobs
-        if job.state in words and not job.shift_ended
-    ]
+    """Check that no job is unfinished or abandoned, except by the end of the shift."""
+    findings: list[Finding] = []
+    for job in fleet.jobs:
+        why = job.reason or "no reason"
+        if job.state == "unfinished" and not job.shift_ended:  # a person must look at the cell
+            what = f"'{job.job}' is unfinished, so its outcome is unknown: {why}"
+            findings.append(Finding("fault", what, "unfinished", job.job))
+        elif job.state == "given_up" and not job.shift_ended:
+            findings.append(Finding("warning", f"'{job.job}' is abandoned: {why}", "given_up", job.job))
+    return findings
 
 
 def check_progress(fleet: FleetSnapshot, earlier: FleetSnapshot | None) -> list[Finding]:
@@ -186,8 +202,8 @@ def check_progress(fleet: FleetSnapshot, earlier: FleetSnapshot | None) -> list[
 
 
 def reason_class(reason: str) -> str:
-    """Class of the reason of a waiting job, of `REASONS`; "other" for any other one, "queue" for none yet."""
-    return "queue" if not reason else next((name for part, name in REASONS.items() if part in reason), "other")
+    """Class of the reason of a waiting job, of `REASONS` or `OTHER`; "queue" for none yet."""
+    return "queue" if not reason else next((name for part, name in REASONS.items() if part in reason), OTHER)
 
 
 def _in_the_way(reason: str) -> list[str]:
@@ -270,6 +286,11 @@ def check_arm(arm: ArmSnapshot, offset_s: float | None) -> list[Finding]:
         offset = f"{abs(offset_s):.1f} s {'ahead of' if offset_s > 0 else 'behind'} fleet time"
         findings.append(Finding("fault", f"{arm.arm} is {offset}: its machine may be overloaded, or its process hang."))
     return findings
+
+
+def common_offset_s(offsets_s: Collection[float]) -> float:
+    """The least offset if all have the same sign, as after a change of the auctioneer's clock; otherwise 0."""
+    return max(0.0, min(offsets_s, default=0.0)) + min(0.0, max(offsets_s, default=0.0))
 
 
 def best_clock(probes: Sequence[ClockProbe]) -> FleetClock | None:

@@ -44,6 +44,8 @@ _LOG = logging.getLogger(__name__)
 FRESH_S = 3.0
 """Real seconds: an arm is present when it shows its token and its last state is no older than this."""
 MAX_NAMES, MAX_JOBS, MAX_ALARMS = 1024, 4096, 256
+ENDED: tuple[auction.JobState, ...] = ("finished", *auction.ABANDONED)
+"""States of jobs that need nobody any more."""
 COMPLETE_BYTES = 32_000
 """A status reply that is smaller, and has fewer jobs than one message may have, names all jobs."""
 
@@ -61,17 +63,21 @@ OnPresence = Callable[[Role, str, bool], None]
 
 
 class Recent(OrderedDict[Key, Value]):
-    """A dict that keeps the `most` keys set last, in the order of their last setting."""
+    """A dict of at most `most` keys in the order of their last setting; of too many, the first is dropped.
 
-    def __init__(self, most: int) -> None:
+    Args:
+        lasts: Values that are dropped only if there are no others.
+    """
+
+    def __init__(self, most: int, lasts: Callable[[Value], bool] = lambda value: False) -> None:
         super().__init__()
-        self._most = most
+        self._most, self._lasts = most, lasts
 
     def __setitem__(self, key: Key, value: Value) -> None:
         super().__setitem__(key, value)
         self.move_to_end(key)
         if len(self) > self._most:
-            self.popitem(last=False)
+            del self[next((key for key, value in self.items() if not self._lasts(value)), next(iter(self)))]
 
 
 class JobScore(msgspec.Struct, frozen=True):
@@ -150,7 +156,7 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
     arms: tuple[ArmSnapshot, ...]
     auctioneers: tuple[AuctioneerSnapshot, ...]
     counts: dict[str, int]
-    """Number of jobs by state."""
+    """Number of jobs by state, of the `MAX_JOBS` that are kept: of more, those that have ended are dropped first."""
     jobs: tuple[JobStatus, ...]
     """The most recently changed last."""
     space: dict[str, tuple[str, ...]] = {}
@@ -159,6 +165,8 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
     """Who paused an arm, by arm, from the last status reply; "*" for all arms."""
     speed: float | None = None
     """Fleet seconds per real second."""
+    changes: dict[str, int] = {}
+    """Number of changes of jobs by new state, since this listener began and of those that were still cached."""
     alarms: tuple[Alarm, ...] = ()
     """Those that last, and the last of the others; the most recently changed last."""
 
@@ -199,6 +207,15 @@ class _Auctioneer:
     heard_s: float | None = None
     time_s: float = -math.inf
     """Fleet time of its last reply."""
+    counted: tuple[str, int] = "", -1
+    """Epoch and number of its last result."""
+
+    def count(self, result: Result, changes: Counter[str]) -> None:
+        """Count a result by the new state of its job; repeated ones, as after a restart, are not counted."""
+        epoch, number = self.counted
+        if result.epoch != epoch or result.number > number:
+            changes[result.status.state] += 1
+            self.counted = result.epoch, result.number
 
 
 @dataclass
@@ -221,8 +238,12 @@ class FleetView:
     _auctioneers: "Recent[str, _Auctioneer]" = field(default_factory=lambda: Recent(MAX_NAMES))
     _space: dict[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
     _paused: dict[str, str] = field(default_factory=dict[str, str])
-    _jobs: "Recent[str, _Job]" = field(default_factory=lambda: Recent(MAX_JOBS))
-    _alarms: "Recent[str, Alarm]" = field(default_factory=lambda: Recent(MAX_ALARMS))
+    _jobs: "Recent[str, _Job]" = field(
+        default_factory=lambda: Recent(MAX_JOBS, lambda job: job.status.state not in ENDED)
+    )
+    _changes: Counter[str] = field(default_factory=Counter[str])
+    alarms: "Recent[str, Alarm]" = field(default_factory=lambda: Recent(MAX_ALARMS, lambda one: one.ended_s is None))
+    """The last message of each alarm, by name."""
 
     def set_token(self, role: Role, name: str, present: bool) -> bool:
         """Note that a token appeared or disappeared; return whether that is a change."""
@@ -233,14 +254,17 @@ class FleetView:
     def update(self, name: str, message: msgspec.Struct, now_s: float) -> None:
         """Apply a message that arrived at the real second `now_s`; other types are ignored."""
         if isinstance(message, Announcement | Result):
-            self._auctioneer(name).heard_s = now_s
+            auctioneer = self._auctioneer(name)
+            auctioneer.heard_s = now_s
             if isinstance(message, Result):
+                auctioneer.count(message, self._changes)
                 self._set_status(message.status, now_s, message.number)
         elif isinstance(message, Operation):
             if message.time_s >= max((known.time_s for known in self._auctioneers.values()), default=-math.inf):
                 self._pause(message.request)
         elif isinstance(message, Alarm):
-            self._alarms[message.alarm] = message
+            if _is_later(message, self.alarms.get(message.alarm)):
+                self.alarms[message.alarm] = message
         elif isinstance(message, State):
             arm = self._arm(name)
             arm.follow(message)
@@ -289,11 +313,12 @@ class FleetView:
                 for name, known in sorted(self._auctioneers.items())
             ),
             counts=dict(Counter(status.state for status in statuses)),
+            changes=dict(self._changes),
             jobs=tuple(statuses[-jobs:]) if jobs > 0 else (),
             space=self._space,
             paused=dict(self._paused),
             speed=self.speed,
-            alarms=tuple(self._alarms.values()),
+            alarms=tuple(self.alarms.values()),
         )
 
     def _pause(self, request: ControlRequest) -> None:
@@ -388,6 +413,14 @@ class FleetListener:
             self.view.update_jobs(reply, time.monotonic())
         if not answers.refused:
             self.view.forget_other_jobs(replies, asked_s)
+
+
+def _is_later(alarm: Alarm, kept: Alarm | None) -> bool:
+    """Whether a message of an alarm replaces the one kept: of the same monitor by its number, otherwise by its time."""
+    if kept is None or (alarm.monitor == kept.monitor and alarm.number > kept.number):
+        return True
+    order, kept_order = ((each.time_s, each.by != "", each.ended_s is not None) for each in (alarm, kept))
+    return order > kept_order or (order == kept_order and alarm.monitor != kept.monitor)
 
 
 def _progress(status: JobStatus) -> tuple[object, ...]:

@@ -30,14 +30,49 @@ function startPage() {
 
   // Messages
 
-  function note(key, timeS, who, what, kind) {
+  // A sentence of the journal, the latest first; without a time it is of now.
+  function note(key, timeS, what, kind) {
     if (noted.has(key)) return;
     noted.add(key);
     if (noted.size > 4 * MOST_NOTES) noted.delete(noted.values().next().value);
-    const row = make("tr", kind ? { class: kind } : {}, ...[timeS === null ? "—" : clock(timeS), who, what].map((text) => make("td", {}, visible(text))));
+    const atS = timeS ?? Math.max(0, ...[...fleet.arms.values()].map((arm) => arm.state ? arm.state.time_s : 0));
+    const row = make("tr", kind ? { class: kind } : {}, ...[clock(atS), `${what.replace(/\.$/, "")}.`].map((text) => make("td", {}, visible(text))));
+    row.dataset.timeS = atS;
     const body = element("journal").tBodies[0];
-    body.prepend(row);
+    body.insertBefore(row, [...body.rows].find((other) => Number(other.dataset.timeS) <= atS) || null);
     if (body.rows.length > MOST_NOTES) body.lastElementChild.remove();
+  }
+
+  // What an arm reports, as a sentence; "" for what the result of the job says.
+  function eventText(arm, { kind, job, joint, value, reason }) {
+    const because = reason ? `: ${reason}` : "", during = job ? ` during ${job}` : "";
+    switch (kind) {
+      case "award": case "finish": return "";
+      case "home": return `${arm} is at home${job ? ` after ${job}` : ""}`;
+      case "warning": return `${arm} became warm${during}${because}`;
+      case "torque_warning": return `The torque of ${arm}, joint ${joint}, is above its warning limit${during}${because}`;
+      case "fault": return `${arm} stopped by a fault${during}${because}`;
+      case "recover": return `${arm} recovered${because}`;
+      case "return": return `${arm} returned ${job}${because}`;
+      case "moved": return `A person moved ${arm} home${because}`;
+      case "break": return `${arm} has a break${reason ? ` (${reason})` : ""} of ${Math.round(value / 60)} min`;
+      case "break_end": return `The break of ${arm} ended`;
+      default: return `${arm}: ${kind.replace("_", " ")}${during}${because}`;
+    }
+  }
+
+  // A change of a job, as a sentence; "" for the begin of its last cycle.
+  function resultText({ status: { job, state, arm, reason, accepted_s: acceptedS, finished_s: finishedS, due_s: dueS }, by, time_s: timeS }) {
+    const because = reason ? `: ${reason}` : "", person = by ? ` by ${by}` : "";
+    const lateS = finishedS != null && dueS != null ? finishedS - dueS : 0;
+    switch (state) {
+      case "finishing": return "";
+      case "waiting": return acceptedS === timeS ? `${job} was submitted${person}` : `${job} waits again${because}`;
+      case "awarded": return `${job} was awarded to ${arm}`;
+      case "finished": return by ? `${job} is finished, as ${by} stated` : `${arm} finished ${job}${lateS > 0 ? `, ${clock(lateS)} late` : ""}`;
+      case "unfinished": return `${job} is unfinished${because}`;
+      default: return `${job} was ${state.replace("_", " ")}${person}${because}`;
+    }
   }
 
   function setJob(status, result) {
@@ -93,27 +128,26 @@ function startPage() {
       }
     },
     event(name, event) {
-      const value = event.value === undefined || event.value === null ? "" : `${event.kind === "award" ? "d " : ""}${event.value.toFixed(1)}`;
-      const what = [event.kind.replace("_", " "), event.joint ? `joint ${event.joint}` : "", value, event.job && `(${event.job})`, event.reason].filter(Boolean).join(" ");
-      note(`event/${name}/${event.number}`, event.time_s, name, what, ["fault", "contact", "warning"].includes(event.kind) ? event.kind : "");
+      const what = eventText(name, event);
+      if (what) note(`event/${name}/${event.number}`, event.time_s, what, ["fault", "contact", "warning"].includes(event.kind) ? event.kind : "");
     },
     result(name, result) {
-      const { status } = result, arm = status.arm ? ` ${status.state === "awarded" ? "to" : "by"} ${status.arm}` : "";
-      setJob(status, result);
-      note(`result/${name}/${result.number}/${result.time_s}`, result.time_s, result.by || name, `${status.job}: ${status.state.replace("_", " ")}${arm}${status.reason ? `: ${status.reason}` : ""}`);
+      const what = resultText(result);
+      setJob(result.status, result);
+      if (what) note(`result/${name}/${result.number}/${result.time_s}`, result.time_s, what);
     },
     operation(name, { time_s: timeS, request }) {
-      note(`operation/${request.request}`, timeS, request.by || "no name given", describe(request.action), "operation");
+      note(`operation/${request.request}`, timeS, `${request.by || "Nobody named"} ${describe(request.action)}`, "operation");
     },
     presence(_, { role, name, there }) {
       if (role === "arm") {
         const arm = armOf(name);
-        if (arm.token !== there) note(`presence/${name}/${performance.now()}`, null, name, there ? "joined" : "left");
+        if (arm.token !== there) note(`presence/${name}/${performance.now()}`, null, `${name} ${there ? "joined" : "left"}`);
         arm.token = there;
         changed.add(name);
       } else if (there && connected) setTimeout(() => load().catch(() => {}), POLL_MS); // it needs a moment
     },
-    gap: () => note(`gap/${performance.now()}`, null, "gateway", "some events were missed"),
+    gap: () => note(`gap/${performance.now()}`, null, "The gateway missed some events"),
   };
   function onMessage(topic, data) {
     if (apply[topic]) apply[topic](data.name, data.message);
@@ -173,6 +207,13 @@ function startPage() {
     const named = new Set(snapshot.jobs.map(({ job }) => job));
     for (const job of [...fleet.jobs.keys()]) if (!named.has(job)) fleet.jobs.delete(job);
     for (const status of snapshot.jobs) setJob(status);
+    for (const { alarm, what, by, time_s: timeS, began_s: beganS, ended_s: endedS } of snapshot.alarms) {
+      const began = `alarm/${alarm}/began`, seen = `alarm/${alarm}/seen`, ended = `alarm/${alarm}/ended`;
+      note(began, beganS, `Alarm: ${what}`, "fault");
+      if (by && (endedS === null || noted.has(ended))) note(seen, timeS, `${by} acknowledged the alarm: ${what}`, "operation");
+      if (endedS !== null) note(ended, endedS, `The alarm ended${by ? `, acknowledged by ${by}` : ""}: ${what}`);
+      if (endedS !== null && by) noted.add(seen); // its time is not known
+    }
     dirty = true;
   }
 

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from agents.auction import Consensus
 from docs.bus_contract import EXAMPLES
-from fleet.bus.client import BusClient
+from fleet.bus.client import AnotherReplies, BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobSpec, Status, StatusRequest, Submission, SubmissionReply
 from fleet.bus.protocol.cell import Cell, CellRequest
@@ -26,6 +26,7 @@ from fleet.live.arm.estimator import Estimator, NominalPeaks
 from fleet.live.arm.node import ArmConfig, ArmNode
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.clock import FleetClock
+from fleet.live.consensus import node as node_module
 from fleet.live.consensus.node import ConsensusNode, Membership
 from fleet.live.journal import Journal
 from fleet.live.leases import Timing
@@ -148,6 +149,19 @@ def bus(tmp_path, small):
             operations=operations,
             done_by_journals=done_by_journals,
         )
+
+
+def test_a_restarted_arm_knows_its_peers_before_it_replies_for_them(bus, monkeypatch):
+    """`arm_0` replies for the fleet, also if the bid of a peer begins the fleet's time of a restarted arm first."""
+    for name in ROSTER:
+        bus.arm(name)
+    assert bus.serve(lambda: all(one.work_source._begun for one in bus.arms.values()))
+    bus.kill("arm_2")
+    monkeypatch.setattr(node_module, "LISTEN_S", PATIENCE_S)
+    restarted = bus.arm("arm_2").work_source
+    restarted._begun = True
+    with pytest.raises(AnotherReplies):
+        restarted._check_first()
 
 
 def settled(bus, *names):

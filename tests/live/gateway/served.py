@@ -25,9 +25,9 @@ class Served:
 
     async def run(self):
         with listen("127.0.0.1", self.port) as bound, BusClient(self.endpoint, "f") as link:
-            async with AsyncBridge(link, self.readers.wake) as self.gateway:
+            self.port = bound.getsockname()[1]
+            async with AsyncBridge(link, self.readers.wake, monitor=f"gateway-{self.port}") as self.gateway:
                 self.server = Server(application(self.gateway, self.readers, **self.options), self.readers)
-                self.port = bound.getsockname()[1]
                 self.started.set()
                 await self.server.serve(sockets=[bound])
 

@@ -21,6 +21,7 @@ from fleet.live.monitor.snapshot import ArmSnapshot, AuctioneerSnapshot, FleetLi
 from scenarios.live import webhooks
 from scenarios.live.metrics import METRICS, exposition
 from scenarios.live.webhooks import MOST_WAITING, Webhook
+from tests.live.gateway.served import Served
 from tests.waiting import PATIENCE_S, wait_until
 
 ODD = 'a"b\\c\nd'
@@ -66,6 +67,7 @@ FLEET = FleetSnapshot(
         JobStatus("k", "waiting"),
     ),
     speed=60.0,
+    changes={"finished": 5000},
 )  # fmt: skip
 
 
@@ -78,6 +80,7 @@ def test_the_metrics_are_in_the_text_format_of_prometheus():
     assert types == {f"thermofleet_{name}": kind for name, (kind, _) in METRICS.items()}
     assert {name for name, _ in values} == set(types)
     assert value("jobs", state="waiting") == 2
+    assert value("job_changes_total", state="finished") == 5000
     assert (value("waiting_jobs", reason="space"), value("waiting_jobs", reason="queue")) == (1, 1)
     assert value("oldest_waiting_seconds") == 60.0
     assert value("motor_temperature_celsius", arm=ODD, joint="2") == 55.5
@@ -86,6 +89,15 @@ def test_the_metrics_are_in_the_text_format_of_prometheus():
     assert value("silence_seconds", participant="au", role="auctioneer") == 1.5
     assert value("present", arm="b") == 0
     assert value("alarms", kind="fault", acknowledged="no") == 1
+
+
+def test_what_is_counted_is_0_if_there_is_none():
+    values, _ = parsed(exposition(FleetSnapshot("f", (), (), {}, ()), Counter()))
+    zero = {name for name, labels in values if values[name, labels] == 0.0}
+    assert zero == {f"thermofleet_{name}" for name in ("jobs", "job_changes_total", "waiting_jobs", "alarms")}
+    assert set(values.values()) == {0.0}
+    full, _ = parsed(exposition(FLEET, Counter({("fault", "no"): 1})))
+    assert {key for key in full if key[0] in zero} == {key for key in values if key[0] in zero}
 
 
 def test_the_dashboard_uses_only_metrics_that_are_exported():
@@ -131,6 +143,22 @@ def test_an_alarm_is_shown_acknowledged_and_published(gateway, arm, router):
     labels = (("acknowledged", "yes"), ("fleet", "f"), ("kind", "given_up"))
     assert values["thermofleet_alarms", labels] == 1
     line.close()
+
+
+def test_two_gateways_of_a_fleet_show_one_alarm_with_one_acknowledgement(gateway, arm, router):
+    with Served(router) as second:
+        arm.post(lambda: arm.set("twice lost job", state="given_up", reason="three faults"))
+
+        def alarm_of(shown):
+            found = [each for each in shown.ask("GET", "/v4/alarms")[2] if each["subject"] == "twice lost job"]
+            assert len(found) <= 1
+            return found and found[0]
+
+        first, other = (wait_until(lambda each=each: alarm_of(each)) for each in (gateway, second))
+        assert first["alarm"] == other["alarm"]
+        assert second.ask("POST", "/v4/alarms", {"alarm": first["alarm"], "by": "ann"})[0] == 200
+        wait_until(lambda: alarm_of(gateway)["by"] == "ann")
+        assert gateway.ask("POST", "/v4/alarms", {"alarm": first["alarm"], "by": "bob"})[0] == 409
 
 
 def test_events_of_unknown_kinds_are_counted_together(gateway, router):
@@ -187,6 +215,36 @@ def test_a_webhook_is_signed_and_repeated_until_it_is_accepted(monkeypatch):
         assert head.startswith("POST /in?x=1 HTTP/1.1\r\n")
         at, digest = re.search(r"X-Thermofleet-Signature: t=(\d+),v1=(\w+)", head).groups()
         assert digest == hmac.new(SECRET.encode(), f"{at}.".encode() + body, hashlib.sha256).hexdigest()
+
+
+def test_a_target_that_accepts_nothing_raises_an_alarm_until_it_accepts_one(monkeypatch):
+    """Its finding has the reason and no path, which may be secret; one failed attempt raises none."""
+    monkeypatch.setattr(webhooks, "RETRY_S", (0.0, 0.0))
+
+    async def run():
+        requests = asyncio.Queue()
+        async with await receiver([500, 200, 403, 403, 403, 200], requests) as server, asyncio.timeout(PATIENCE_S):
+            port = server.sockets[0].getsockname()[1]
+            hook = Webhook(f"http://127.0.0.1:{port}/secret", SECRET)
+            task = asyncio.create_task(hook.run())
+            hook.send(ALARM)
+            hook.send(ALARM)
+            found = []
+            for _ in range(2):
+                await requests.get()
+            found.append(hook.findings())  # the first alarm failed once, and is accepted in its second attempt
+            while not hook.findings():
+                await asyncio.sleep(0)
+            found.append(hook.findings())
+            hook.send(ALARM)
+            while hook.findings():
+                await asyncio.sleep(0)
+            task.cancel()
+            return port, found
+
+    port, found = asyncio.run(run())
+    what = f"The webhook at 127.0.0.1:{port} accepts no alarms: status 403."
+    assert [[(each.kind, each.what) for each in findings] for findings in found] == [[], [("webhook", what)]]
 
 
 def test_a_target_that_never_replies_holds_a_bounded_number_of_alarms_and_nothing_else():

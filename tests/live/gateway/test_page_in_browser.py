@@ -12,7 +12,17 @@ from playwright.sync_api import expect, sync_playwright
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.operator import Cancel, Change, ClearRequest, Pause, ResetRequest, Settle
+from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
+from fleet.bus.protocol.operator import (
+    Cancel,
+    Change,
+    ClearRequest,
+    ControlRequest,
+    Operation,
+    Pause,
+    ResetRequest,
+    Settle,
+)
 from fleet.bus.router import Router
 from scenarios.live.gateway import LivePage
 from tests.live.gateway.moving_fleet import MovingFleet
@@ -134,7 +144,7 @@ def test_a_job_of_the_form_is_quoted_submitted_and_finished(served, fleet, open_
     expect(page.locator("#offers tbody")).to_contain_text("✔ arm_0")
     page.locator("#settled-part summary").click()
     expect(page.locator("#settled tbody tr")).to_contain_text("✔ finished")
-    expect(page.locator("#journal")).to_contain_text("my crate: finished by arm_0")
+    expect(page.locator("#journal")).to_contain_text("arm_0 finished my crate.")
 
 
 @pytest.mark.ci_slow
@@ -193,6 +203,28 @@ def test_a_fault_is_told_in_words_and_reset(served, fleet, open_page):
     confirm(page)
     answer(page).to_contain_text("arm_1: its fault is cleared")
     assert fleet.requests[-1] == ResetRequest("ann")
+
+
+def test_the_journal_has_sentences_with_names_in_order_of_time(served, fleet, open_page):
+    page = open_page(served)
+    job = JobStatus("crate", "finished", arm="arm_1", cycles=1, due_s=4000.0, finished_s=4065.0)
+    for number, (time_s, kind, more) in enumerate(
+        ((8000.0, "recover", {"reason": "cool again"}), (7000.0, "fault", {"job": "crate", "reason": "joint 2 is hot"}),
+         (7500.0, "award", {"job": "crate", "reason": "plan 1, twin d:a37e7d"}), (4067.0, "home", {"job": "crate"}))
+    ):  # fmt: skip
+        event = ArmEvent("arm_1", number, time_s, kind, **more)
+        fleet.post(lambda event=event: fleet.events["arm_1"](event))
+    fleet.post(lambda: fleet.results(Result("auctioneer", 99, 4065.0, job)))
+    request = ControlRequest("7", Change("crate", due_s=9000.0), "ann")
+    fleet.post(lambda: fleet.operations(Operation("auctioneer", 7600.0, request, 99)))
+    expect(page.locator("#journal tbody tr")).to_have_count(5)
+    assert [row.split("\t") for row in page.locator("#journal tbody tr").all_inner_texts()] == [
+        ["2:13:20", "arm_1 recovered: cool again."],
+        ["2:06:40", "ann changed crate: due at 2:30:00."],
+        ["1:56:40", "arm_1 stopped by a fault during crate: joint 2 is hot."],
+        ["1:07:47", "arm_1 is at home after crate."],
+        ["1:07:45", "arm_1 finished crate, 0:01:05 late."],
+    ]
 
 
 @pytest.mark.ci_slow

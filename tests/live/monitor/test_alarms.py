@@ -1,16 +1,18 @@
 """Alarms begin once, end once, survive a restart from their messages, and keep who has seen them."""
 
 from datetime import UTC, datetime
+from itertools import product
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.bus.protocol.auction import JobStatus
+from fleet.bus.protocol.auction import JobStatus, Status
 from fleet.bus.protocol.operator import Alarm
 from fleet.errors import Refused
 from fleet.live.monitor.alarms import HOLD_S, AlarmList
-from fleet.live.monitor.health import Finding, check_jobs
+from fleet.live.monitor.health import Finding, check_jobs, check_replies
 from fleet.live.monitor.snapshot import MAX_ALARMS, FleetSnapshot, FleetView
 from tests.live.monitor.messages import state
 
@@ -21,7 +23,7 @@ NOON = datetime(2026, 1, 31, 12, 0, tzinfo=UTC)
 @given(st.lists(st.booleans(), min_size=1, max_size=60))
 def test_an_alarm_lasts_from_the_first_finding_until_a_pause_longer_than_the_hold(there):
     """By hand: one check a second; a run of more than `HOLD_S` checks without the finding separates two alarms."""
-    alarms = AlarmList("m")
+    alarms = AlarmList("m", {})
     changes = [alarms.update([HOT] if each else [], float(s), float(s)) for s, each in enumerate(there)]
     text = "".join("x" if each else " " for each in there)
     runs = [run for run in text.split(" " * (int(HOLD_S) + 1)) if "x" in run]
@@ -36,13 +38,13 @@ def test_an_alarm_lasts_from_the_first_finding_until_a_pause_longer_than_the_hol
 
 def test_a_restart_continues_the_alarms_of_its_messages():
     """The same finding raises no second alarm; who has seen it is kept; one that is gone ends after the hold."""
-    first = AlarmList("m")
+    first = AlarmList("m", {})
     sent = first.update([HOT, Finding("fault", "no one works", "no_progress", "space")], 10.0, 1000.0)
     sent.append(first.acknowledge(sent[0].alarm, " ann ", 12.0, NOON))
-    again = AlarmList("m", sent)
+    again = AlarmList("m", {}, sent)
     assert again.update([HOT], 20.0, 3000.0) == []
-    (ended,) = again.update([HOT], 30.0, 3000.0 + HOLD_S + 0.1)
-    assert (ended.kind, ended.ended_s, ended.number) == ("no_progress", 30.0, 4)
+    (ended,) = again.update([HOT], 26.0 + HOLD_S, 3006.0 + HOLD_S)
+    assert (ended.kind, ended.ended_s, ended.number) == ("no_progress", 20.0, 4)  # when it was last there
     kept = again.alarms[sent[0].alarm]
     assert (kept.by, kept.acknowledged, kept.ended_s) == ("ann", "2026-01-31T12:00:00Z", None)
     with pytest.raises(Refused, match="'ann' has acknowledged it at 2026-01-31T12:00:00Z"):
@@ -53,7 +55,8 @@ def test_a_restart_continues_the_alarms_of_its_messages():
 
 
 def test_the_list_is_bounded_and_keeps_what_lasts():
-    alarms, every = AlarmList("m"), [Finding("warning", str(n), "given_up", str(n)) for n in range(5 * MAX_ALARMS)]
+    alarms = AlarmList("m", FleetView("f").alarms)
+    every = [Finding("warning", str(n), "given_up", str(n)) for n in range(5 * MAX_ALARMS)]
     alarms.update([HOT], 0.0, 0.0)
     for n, finding in enumerate(every):
         alarms.update([HOT, finding], 0.0, 10.0 * n)
@@ -63,8 +66,65 @@ def test_the_list_is_bounded_and_keeps_what_lasts():
     assert len(alarms.alarms) == MAX_ALARMS
 
 
+def test_two_monitors_raise_acknowledge_and_end_one_alarm():
+    """Both hear each other: one name, whoever raises it; nothing is sent twice, and who has seen it is kept."""
+    views = FleetView("f"), FleetView("f")
+    lists = [AlarmList(name, view.alarms) for name, view in zip("mn", views, strict=True)]
+
+    def send(*changes):
+        for change, view in product(changes, views):
+            view.update(change.monitor, change, 0.0)
+
+    (both,) = {each.update([HOT], 10.0, 0.0)[0].alarm for each in lists}  # in the same second
+    send(*views[0].alarms.values(), *views[1].alarms.values())
+    send(lists[1].acknowledge(both, "ann", 12.0, NOON))
+    with pytest.raises(Refused, match="'ann' has acknowledged it"):
+        lists[0].acknowledge(both, "bob", 13.0, NOON)
+    changes = lists[0].update([], 20.0, HOLD_S + 0.1)
+    send(*changes)
+    assert [each.update([], 21.0, HOLD_S + 1.0) for each in lists] == [[], []]
+    for view in views:
+        (alarm,) = view.snapshot(0.0).alarms
+        assert (alarm.alarm, alarm.by, alarm.ended_s) == (both, "ann", pytest.approx(14.9))  # last found 5.1 s before
+    (again,) = lists[0].update([HOT], 30.0, 30.0)
+    send(again)
+    assert lists[1].update([HOT], 31.0, 31.0) == []
+    assert (again.by, again.began_s, again.ended_s) == ("", 30.0, None)
+
+
+def test_a_monitor_that_joins_takes_up_the_alarms_of_another_and_ends_only_what_it_has_found():
+    view = FleetView("f")
+    for finding in (HOT, Finding("warning", "b is faulted.", "fault", "b")):
+        for change in AlarmList("m", {}).update([finding], 1.0, 0.0):
+            view.update("m", change, 0.0)
+    joined = AlarmList("n", view.alarms)
+    assert joined.update([HOT], 20.0, 20.0) == []
+    assert [each.subject for each in joined.update([], 30.0, 30.0)] == ["a"]
+    assert [each.subject for each in view.alarms.values() if each.ended_s is None] == ["b"]
+
+
+def test_a_late_message_of_an_alarm_changes_nothing_and_a_new_epoch_does():
+    view = FleetView("f")
+    ended, begun = (Alarm("m", number, time_s, "a", "fault", "?", ended_s=time_s if number == 2 else None)
+                    for number, time_s in ((2, 50.0), (1, 40.0)))  # fmt: skip
+    for message in (ended, begun, msgspec.structs.replace(begun, monitor="n")):
+        view.update(message.monitor, message, 0.0)
+        assert view.alarms["a"] is ended
+    fresh = msgspec.structs.replace(begun, number=3, time_s=1.0)
+    view.update("m", fresh, 0.0)
+    assert view.alarms["a"] is fresh
+
+
+def test_an_alarm_about_no_participant_ends_with_its_finding():
+    waits = Finding("fault", "no one works", "no_progress", "space")
+    alarms = AlarmList("m", {})
+    alarms.update([waits], 0.0, 0.0, heard={"a"})
+    (ended,) = alarms.update([], 9.0, 9.0, heard={"a"})
+    assert (ended.time_s, ended.ended_s) == (9.0, 0.0)
+
+
 def test_findings_without_a_kind_raise_no_alarm():
-    assert AlarmList("m").update([Finding("fault", "The router is slow.")], 0.0, 0.0) == []
+    assert AlarmList("m", {}).update([Finding("fault", "The router is slow.")], 0.0, 0.0) == []
 
 
 @pytest.mark.parametrize(
@@ -84,8 +144,6 @@ def test_findings_without_a_kind_raise_no_alarm():
     ],
 )
 def test_an_arm_without_a_job_says_why(change, waiting, paused, says):
-    from fleet.bus.protocol.auction import JobStatus, Status
-
     view = FleetView("f")
     view.set_token("arm", "a", True)
     view.update("a", state(**change), 0.0)
@@ -113,17 +171,29 @@ def test_work_and_heat_are_sums_over_the_time_between_states():
 def test_an_alarm_of_an_unheard_arm_lasts_until_somebody_has_seen_it():
     """A monitor that begins anew does not know the arm that fell silent before, so its silence tells nothing."""
     silent = Alarm("m", 1, 10.0, "a1", "absent", "arm_2 is absent", "arm_2", 10.0)
-    alarms = AlarmList("m", [silent])
+    alarms = AlarmList("m", {}, [silent])
     for second in range(20):
         assert alarms.update([], 20.0 + second, float(second), heard={"arm_1"}) == []
     alarms.acknowledge("a1", "ada", 41.0, NOON)
     ended = [each for second in range(20, 40) for each in alarms.update([], 60.0, float(second), heard={"arm_1"})]
-    assert [each.ended_s for each in ended] == [60.0]
+    assert [each.ended_s for each in ended] == [60.0 - (HOLD_S + 1.0)]
+
+
+def test_the_alarm_of_a_silence_begins_with_the_last_reply():
+    """By hand: 20 s without a reply, at 60 fleet seconds a second, before fleet time 2000 s."""
+    view = FleetView("f")
+    view.set_token("arm", "a", True)
+    view.set_token("auction", "au", True)
+    view.update_jobs(Status("au", 800.0, ()), 0.0)
+    view.update("a", state(time_s=2000.0), 20.0)
+    findings = check_replies(view.snapshot(20.0))
+    (alarm,) = AlarmList("m", {}).update(findings, 2000.0, 20.0, speed=60.0)
+    assert (alarm.kind, alarm.subject, alarm.time_s, alarm.began_s) == ("silent", "au", 2000.0, 800.0)
 
 
 def test_the_end_of_the_shift_raises_no_alarm_and_the_text_of_an_absence_stays_true():
     lasting = Finding("fault", "arm_1 publishes its state but shows no token", "absent", "arm_1")
-    (begun,) = AlarmList("m").update([lasting], 5.0, 5.0)
+    (begun,) = AlarmList("m", {}).update([lasting], 5.0, 5.0)
     assert begun.what == "arm_1 is absent: it has left, or its process hangs or has ended."
     jobs = (JobStatus("a", "unfinished", shift_ended=True), JobStatus("b", "unfinished", reason="An arm stopped."))
     fleet = FleetSnapshot("f", (), (), {}, jobs)

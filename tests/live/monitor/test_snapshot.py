@@ -2,6 +2,7 @@
 
 import time
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -112,6 +113,30 @@ def test_an_older_result_changes_nothing_and_a_status_adds_jobs_without_one():
     seen.update_jobs(Status("au", 1.0, (JobStatus("x", "waiting"), JobStatus("y", "finished"))), 0.0)
     assert seen.snapshot(4.0).counts == {"waiting": 1, "finished": 1}
     assert seen.snapshot(4.0).auctioneers[0].heard_age_s == 4.0
+
+
+def test_changes_of_jobs_are_counted_beyond_those_that_are_kept(monkeypatch):
+    """By hand: 20 jobs are awarded and finished; an older result, and a status of a dropped job, count nothing."""
+    monkeypatch.setattr(snapshot_module, "MAX_JOBS", 3)
+    seen = FleetView("f")
+    for number in range(20):
+        seen.update("au", result(2 * number, f"j{number}"), 0.0)
+        seen.update("au", result(2 * number + 1, f"j{number}", "finished"), 0.0)
+    seen.update("au", result(3, "j1", "finished"), 0.0)
+    seen.update_jobs(stands(5.0, "j2"), 0.0)
+    now = seen.snapshot(0.0)
+    assert now.changes == {"awarded": 20, "finished": 20}
+    assert sum(now.counts.values()) == 3
+    seen.update("au", msgspec.structs.replace(result(0, "k"), epoch="new"), 0.0)
+    assert seen.snapshot(0.0).changes["awarded"] == 21
+
+
+def test_jobs_that_have_ended_are_dropped_before_those_that_wait(monkeypatch):
+    monkeypatch.setattr(snapshot_module, "MAX_JOBS", 3)
+    seen = FleetView("f")
+    for number in range(10):
+        seen.update("au", result(number, f"j{number}", "finished" if number else "waiting"), 0.0)
+    assert [job.job for job in seen.snapshot(0.0).jobs] == ["j0", "j8", "j9"]
 
 
 def test_too_many_names_drop_the_oldest(monkeypatch):
