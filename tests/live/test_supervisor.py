@@ -255,7 +255,7 @@ with Supervisor(Path({folder!r}), program=("own",), main=lambda words: main(list
 def test_command_lines_of_the_program_are_forks_that_share_its_memory(tmp_path, end, code):
     import subprocess
 
-    script = FORKS.format(folder=str(tmp_path), wait=WAIT, end=end)
+    script = FORKS.format(folder=str(tmp_path), wait=SUPERVISED, end=end)
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=PATIENCE_S)
     assert (done.returncode, done.stdout.count("not written twice")) == (code, 1), done.stderr
     child, rss_kb, pss_kb = map(int, done.stdout.splitlines()[-1].split())
