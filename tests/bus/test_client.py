@@ -230,19 +230,6 @@ def test_a_malformed_question_is_answered_with_what_is_wrong(bus, payload, said,
     assert teller.malformed == 1
 
 
-def test_a_late_joiner_hears_the_last_words(bus):
-    arm = bus()
-    say = arm.publisher(keys.of_arm("f", "arm_0", "event"), ArmEvent)
-    for number in range(3):
-        say(ArmEvent(arm="arm_0", number=number, time_s=1.0, kind="finish"))
-    late, heard = bus(), []
-    late.subscribe(
-        keys.of_every_arm("f", "event"), ArmEvent, lambda arm, word: heard.append((arm, word.number)), history=True
-    )
-    serve_until(lambda: len(heard) == 3, late)
-    assert heard == [("arm_0", 0), ("arm_0", 1), ("arm_0", 2)]
-
-
 def test_words_that_speak_for_another_are_left_out(bus):
     listener, stranger, heard = bus(), bus(), []
     listener.subscribe(keys.of_every_arm("f", "event"), ArmEvent, lambda arm, word: heard.append(arm))

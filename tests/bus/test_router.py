@@ -34,13 +34,6 @@ def test_the_router_listens_where_it_says():
         open_client(router.endpoint, timeout_s=PATIENCE_S).close()
 
 
-def test_a_port_in_use_is_named():
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        with pytest.raises(BusError, match=f"port {port} .*in use"):
-            Router(port).open()
-
-
 def test_a_port_is_free_again_after_close():
     router = Router().open()
     port = int(router.endpoint.rsplit(":", 1)[1])

@@ -231,28 +231,6 @@ def test_a_dry_run_changes_nothing(bus):
     assert list(arm.book.records()) == before
 
 
-@pytest.mark.ci_slow
-def test_the_cycle_in_progress_counts_when_the_award_is_revoked_and_the_arm_is_at_home_then(bus):
-    auctioneer, line = Auctioneer(bus.link()), bus.link()
-    arm = bus.arm(speed=5.0)  # a cycle of 11 s takes more than three lease requests
-    job = replace(JOB, repetitions=100)
-    assign(bus, line, job)
-    (active,) = arm.node.executor.active
-    begun_s = arm.body.time_s
-    bus.serve(lambda: arm.body.time_s > begun_s + 3.0)
-    auctioneer.revokes = True
-    bus.serve(lambda: active.revoked)
-    assert arm.body.cycles == 0
-    assert not auctioneer.reports
-    assert arm.body.away is not None
-    bus.serve(lambda: auctioneer.reports)
-    (report,) = auctioneer.reports
-    assert (report.outcome, report.cycles, report.unsure) == ("returned", 1, False)
-    assert arm.body.away is None
-    assert arm.node.unfit() == ""
-    assert [r.cycles for _, r in ArmHistory().replay(arm.book.records()).reports.values()] in ([1], [])
-
-
 @pytest.mark.parametrize(("finish", "repetitions"), [("cycle", 40), ("job", 8)])
 def test_an_arm_takes_no_jobs_in_a_break_and_returns_or_finishes_its_own_first(bus, finish, repetitions):
     auctioneer, events, states, line = Auctioneer(bus.link()), [], [], bus.link()
@@ -297,26 +275,7 @@ def test_a_stopped_arm_returns_its_job_as_sure(bus):
 
 
 @pytest.mark.ci_slow
-def test_a_faulted_arm_returns_its_job_with_the_cycles(bus):
-    auctioneer, line, events = Auctioneer(bus.link()), bus.link(), []
-    line.subscribe(keys.of_every_arm("f", "event"), ArmEvent, lambda _, e: events.append(e), history=True)
-    limits = ThermalLimits(warning_c=33.0, error_c=34.0, restart_c=30.0)
-    bus.arm(limits=limits, warning_c=1000.0, speed=600.0, warm=False)
-    long = JobSpec(name="j", kind="hold", places=("bench",), repetitions=5000)
-    assign(bus, line, long)
-    bus.serve(lambda: auctioneer.reports)
-    (report,) = auctioneer.reports
-    fault = next(e for e in events if e.kind == "fault")
-    began_s = next(e for e in events if e.kind == "award").time_s
-    assert (report.outcome, report.time_s, report.faulted) == ("returned", fault.time_s, True)
-    assert report.cycles > 3
-    assert report.cycles == (fault.time_s - began_s - 3.0) // 10.0
-    assert "faulted" in report.reason
-    assert bus.ask(line, "quote", request(), Quote).capacity == 0
-
-
-@pytest.mark.ci_slow
-def test_a_person_clears_the_fault_of_an_arm_and_journal_and_event_name_the_person(bus):
+def test_a_faulted_arm_returns_its_job_with_the_cycles_and_a_person_clears_the_fault(bus):
     auctioneer, line, events = Auctioneer(bus.link()), bus.link(), []
     line.subscribe(keys.of_every_arm("f", "event"), ArmEvent, lambda _, e: events.append(e), history=True)
     limits = ThermalLimits(warning_c=33.0, error_c=34.0, restart_c=30.0, clear_s=1e5)
@@ -325,6 +284,12 @@ def test_a_person_clears_the_fault_of_an_arm_and_journal_and_event_name_the_pers
     long = JobSpec(name="j", kind="hold", places=("bench",), repetitions=5000)
     assign(bus, line, long)
     bus.serve(lambda: auctioneer.reports)
+    (report,) = auctioneer.reports
+    fault = next(e for e in events if e.kind == "fault")
+    began_s = next(e for e in events if e.kind == "award").time_s
+    assert (report.outcome, report.time_s, report.faulted) == ("returned", fault.time_s, True)
+    assert report.cycles == (fault.time_s - began_s - 3.0) // 10.0 > 3
+    assert bus.ask(line, "quote", request(), Quote).capacity == 0
     bus.serve(lambda: arm.body.truth.temp_c[0, 0, WINDING].max() < 29.0)
     assert bus.ask(line, "reset", ResetRequest("ann"), ResetReply).changed
     bus.serve(lambda: any(e.kind == "recover" for e in events))

@@ -82,18 +82,6 @@ def test_a_killed_process_is_restarted_while_its_child_holds_the_output_open(tmp
             os.killpg(supervisor.pid("a"), signal.SIGKILL)
 
 
-def test_a_killed_process_is_restarted(tmp_path):
-    with Supervisor(tmp_path, backoff=Backoff(first_s=0.05)) as supervisor:
-        supervisor.start(part("a", WAIT), ready_s=PATIENCE_S)
-        first = supervisor.pid("a")
-        os.kill(first, signal.SIGKILL)
-        supervisor.run(until(lambda: supervisor.restarts()["a"] == 1 and supervisor.ready("a")), poll_s=0.02)
-        second = supervisor.pid("a")
-        assert second not in (None, first)
-    assert exited(second)
-    assert supervisor.log("a").read_text() == "ready x\nready x\n"
-
-
 def test_a_process_that_always_fails_is_restarted_with_delays(tmp_path):
     start_s = time.monotonic()
     with Supervisor(tmp_path, backoff=Backoff(first_s=0.2, factor=2.0)) as supervisor:

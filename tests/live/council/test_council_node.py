@@ -104,7 +104,7 @@ def bus(tmp_path, small):
             deadline_s = time.monotonic() + PATIENCE_S
             while time.monotonic() < deadline_s:  # no arm may be ready to reply yet
                 got = []
-                outsider.query(key, request, kind, got.append, timeout_s=3.0)
+                outsider.query(key, request, kind, got.append, timeout_s=PATIENCE_S)
                 assert serve(partial(bool, got))
                 if got[0].messages:
                     return next(iter(got[0].messages.values()))
