@@ -299,7 +299,7 @@ def token_reaches():
 
     def wait(link, key):
         deadline_s, pause = time.monotonic() + 120.0, threading.Event()
-        while not link.tokens(key, timeout_s=120.0):
+        while not link.tokens(key):
             assert time.monotonic() < deadline_s, f"{key} was not seen"
             pause.wait(0.02)
 

@@ -262,7 +262,7 @@ class SimulatedClient:
         if self.open_:
             self.process.put(handle, name, name in self.bus.tokens(self.process, expression))
 
-    def tokens(self, expression: str, *, timeout_s: float) -> frozenset[str]:
+    def tokens(self, expression: str) -> frozenset[str]:
         return frozenset(self.bus.tokens(self.process, expression))
 
     # Queries

@@ -70,7 +70,7 @@ class ArmProcess:
         name = process.name
         journal = _journal(process, "awards", ArmRecord)
         clock = fleet_clock(link, self._speed)
-        if link.tokens(keys.of_arm(link.fleet, name, "alive"), timeout_s=1.0):
+        if link.tokens(keys.of_arm(link.fleet, name, "alive")):
             raise BusError(f"'{name}' is already running.")
         history = restart_history(journal, name, clock.now_s(process.real_s))
         self.unsure |= {report.job for _, report in history.reports.values() if report.unsure}

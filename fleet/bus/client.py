@@ -137,7 +137,7 @@ class BusClient(Connection):
         """Prepare a client of the router at `endpoint`.
 
         Args:
-            timeout_s: How long the router may take to accept the connection.
+            timeout_s: How long the router may take to accept the connection, and to list tokens.
             backlog: Maximum number of queued messages; a full queue drops the oldest.
             stopped: Wait for a router until this is true, instead of `timeout_s`.
         """
@@ -272,7 +272,7 @@ class BusClient(Connection):
         deadline_s = time.monotonic() + timeout_s + 1.0
         while not complete and time.monotonic() < deadline_s:
             self.serve(deadline_s)
-        return complete[0] if complete else Replies(took_s=timeout_s)
+        return complete[0] if complete else Replies(refused={"?": ""}, took_s=timeout_s)
 
     def ask(
         self, key: str, request: msgspec.Struct, kind: type[Reply], *, timeout_s: float, attempts: int = 1
@@ -377,12 +377,19 @@ class BusClient(Connection):
 
         self._keep(self._open().liveliness().declare_subscriber(expression, _direct(receive), history=True))
 
-    def tokens(self, expression: str, *, timeout_s: float) -> frozenset[str]:
-        """Names in the keys of the present liveliness tokens; waits for the router's reply."""
+    def tokens(self, expression: str) -> frozenset[str]:
+        """Names in the keys of the present liveliness tokens; waits for the router's reply.
+
+        Raises:
+            BusError: the router did not reply in time: it is unknown who is present.
+        """
         names: set[str] = set()
-        for reply in self._open().liveliness().get(expression, timeout=timeout_s):
-            if reply.ok is not None:
-                self._token(str(reply.ok.key_expr), True, lambda name, _: names.add(name))
+        for reply in self._open().liveliness().get(expression, timeout=self._timeout_s):
+            if reply.ok is None:
+                raise BusError(
+                    f"The router did not reply within {self._timeout_s:g} s: it is unknown who is present. Try again."
+                )
+            self._token(str(reply.ok.key_expr), True, lambda name, _: names.add(name))
         return frozenset(names)
 
     def reject(self, reason: str) -> None:

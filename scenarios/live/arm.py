@@ -245,7 +245,7 @@ def wait_for_name(link: BusClient, name: str, *, patience_s: float = TOKEN_S) ->
         BusError: one is still online.
     """
     deadline_s = time.monotonic() + patience_s
-    while link.tokens(keys.of_arm(link.fleet, name, "alive"), timeout_s=patience_s):
+    while link.tokens(keys.of_arm(link.fleet, name, "alive")):
         if time.monotonic() < deadline_s:
             time.sleep(POLL_S)
             continue
@@ -344,7 +344,7 @@ def refuse_auctioneer(link: BusClient) -> None:
     Raises:
         BusError: the fleet has one.
     """
-    if present := link.tokens(keys.of_every_auction(link.fleet, "alive"), timeout_s=2.0):
+    if present := link.tokens(keys.of_every_auction(link.fleet, "alive")):
         names = ", ".join(sorted(present))
         raise BusError(f"Fleet '{link.fleet}' has an auctioneer: '{names}'. Stop it first, or leave --policy out.")
 

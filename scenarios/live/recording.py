@@ -62,8 +62,8 @@ _COLUMNS = {
 }
 _SORTED_BY: dict[Kind, str] = {"telemetry": "tick", "gaps": "first"}
 """Besides the time; `number` for the other kinds."""
-TURN_S, TOKENS_S = 0.2, 2.0
-"""Real seconds between two checks for a stop request; until the router must have named the present arms."""
+TURN_S = 0.2
+"""Real seconds between two checks for a stop request."""
 
 
 class Gap(msgspec.Struct, frozen=True):
@@ -345,7 +345,7 @@ def replay(messages: RecordedMessages, link: BusClient, *, speed: float, stopped
         FleetError: an arm of the recording is present on the bus.
     """
     arms = sorted(set(messages.telemetry["arm"].to_pylist())) if messages.telemetry.num_rows else []
-    present = link.tokens(keys.of_every_arm(link.fleet, "alive"), timeout_s=TOKENS_S)
+    present = link.tokens(keys.of_every_arm(link.fleet, "alive"))
     if taken := sorted(present & set(arms)):
         raise FleetError(f"Arm '{taken[0]}' of fleet '{link.fleet}' is on the bus already. Give another --fleet.")
     for arm in arms:

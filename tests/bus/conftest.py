@@ -66,11 +66,13 @@ def assert_same() -> Callable[[PeerView, PeerView], None]:
     return assert_equal
 
 
-def stranger(endpoint: str, tls: Mapping[str, object] | None = None, mode: str = "client") -> zenoh.Session:
+def stranger(
+    endpoint: str, tls: Mapping[str, object] | None = None, mode: str = "client", *, timeout_s: float = PATIENCE_S
+) -> zenoh.Session:
     """A session as somebody opens it who has none of our checks."""
     config = {
         "mode": mode,
-        "connect": {"endpoints": [endpoint], "timeout_ms": 300, "exit_on_failure": True},
+        "connect": {"endpoints": [endpoint], "timeout_ms": round(1000 * timeout_s), "exit_on_failure": True},
         "listen": {"endpoints": []},
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {"link": {"tls": tls or {}}},

@@ -524,7 +524,7 @@ def test_closing_leaves_no_thread_and_no_port(make_words):
     bus.share(make_words(np.random.default_rng(0), 3, 0.0))
     bus.close()
     bus.close()
-    assert set(threading.enumerate()) == threads
+    assert set(threading.enumerate()) <= threads
     with Router(int(endpoint.rsplit(":", 1)[1])):
         pass
     with pytest.raises(BusError, match="closed"):
@@ -584,7 +584,7 @@ def test_no_router_is_an_error_and_leaves_nothing_open():
     threads = set(threading.enumerate())
     with pytest.raises(BusError, match="No router answered"):
         ZenohExchange(ARMS, "f", endpoint, timeout_s=0.2).open()
-    assert set(threading.enumerate()) == threads
+    assert set(threading.enumerate()) <= threads
 
 
 BUS_FOUR = ("arm_0", "arm_1", "arm_2", "arm_3")

@@ -141,7 +141,7 @@ class Outsider:
             encoding=encoding,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=60.0,
+            timeout=PATIENCE_S,
         ):
             if reply.ok is not None:
                 key, said = str(reply.ok.key_expr), str(reply.ok.encoding)
@@ -221,7 +221,7 @@ def outside(port: int, fleet: str) -> Iterator[Outsider]:
         "mode": "client",
         "connect": {
             "endpoints": [f"tcp/127.0.0.1:{port}"],
-            "timeout_ms": 60_000,
+            "timeout_ms": round(1000 * PATIENCE_S),
             "exit_on_failure": True,
             "retry": {"period_init_ms": 20, "period_max_ms": 20, "period_increase_factor": 1.0},
         },

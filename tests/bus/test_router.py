@@ -34,13 +34,6 @@ def test_the_router_listens_where_it_says():
         open_client(router.endpoint, timeout_s=PATIENCE_S).close()
 
 
-def test_a_port_in_use_is_named():
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        with pytest.raises(BusError, match=f"port {port} .*in use"):
-            Router(port).open()
-
-
 def test_a_port_is_free_again_after_close():
     router = Router().open()
     port = int(router.endpoint.rsplit(":", 1)[1])
@@ -266,7 +259,6 @@ def test_missed_messages_are_fetched_when_a_router_is_back(place):
 
 def test_the_rate_limit_counts_each_arm_and_not_the_link(place):
     """Four arms of 25 messages a second are as many as one arm may send; behind a link they are one session."""
-    each = 20
     with (
         Router(tls=Tls(place, "router"), state_hz=50.0) as near,
         Router(tls=Tls(place, FAR.name), connect=[near.endpoint], state_hz=50.0) as far,
@@ -289,18 +281,21 @@ def test_the_rate_limit_counts_each_arm_and_not_the_link(place):
             for name, arm in zip(ARMS, arms, strict=True):
                 arm.put(keys.of_arm("f", name, topic), b"x", congestion_control=zenoh.CongestionControl.BLOCK)
 
-        # Scores, which have no limit, mark when all routes are there and when all states have passed.
+        # Scores, which have no limit, mark when all routes are there and when a flood of states has passed.
         wait_until(lambda: len(set(heard)) == len(ARMS), lambda: put_all("difficulty"))
-        for _ in range(each):
+        for _ in range(10):
+            del heard[:]
             put_all("state")
+            wait_until(lambda: sum(key.endswith("/state") for key in heard) == len(ARMS))
             PAUSE.wait(0.04)
-        wait_until(lambda: sum(key.endswith("/state") for key in heard) >= 0.8 * each * len(ARMS))
         del heard[:]
+        began_s = time.monotonic()
         for _ in range(200):
             arms[0].put(keys.of_arm("f", "arm_0", "state"), b"x")
         put_all("difficulty")
         wait_until(lambda: keys.of_arm("f", "arm_0", "difficulty") in heard)
-        assert 1 <= heard.count(keys.of_arm("f", "arm_0", "state")) < 50
+        took_s = time.monotonic() - began_s
+        assert 1 <= heard.count(keys.of_arm("f", "arm_0", "state")) <= 1 + 50.0 * took_s
         listener.undeclare()
 
 

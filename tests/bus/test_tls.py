@@ -56,7 +56,7 @@ def test_a_certificate_that_is_not_good_is_refused_at_both_ends(open_stranger, g
         with open_stranger(guarded.endpoint, tls.link(serves=False)) as rogue:
             assert list(rogue.get(f"{keys.all_of_fleet('f')}", timeout=SHORT_S)) == []
         return
-    with pytest.raises(zenoh.ZError), open_stranger(guarded.endpoint, tls.link(serves=False)):
+    with pytest.raises(zenoh.ZError), open_stranger(guarded.endpoint, tls.link(serves=False), timeout_s=SHORT_S):
         pass
 
 
@@ -74,7 +74,7 @@ def test_an_endpoint_that_says_who_connects_is_enough_for_every_command(guarded,
 
 def test_nobody_gets_in_without_a_certificate(open_stranger, guarded, folder):
     ca = {"root_ca_certificate": str(folder / "ca.pem")}
-    with pytest.raises(zenoh.ZError), open_stranger(guarded.endpoint, ca):
+    with pytest.raises(zenoh.ZError), open_stranger(guarded.endpoint, ca, timeout_s=SHORT_S):
         pass
     with pytest.raises(BusError, match="needs a certificate"):
         open_client(guarded.endpoint, timeout_s=PATIENCE_S)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from fleet.bus.exchange.memory import Exchange
-from fleet.bus.exchange.zenoh import ZenohExchange
 from fleet.engine.batch import TERMS, RewardWeights
 from fleet.engine.tables import drive_of
 from fleet.env.allocation_v2 import AllocationEnv, Episode, parallel_env
@@ -48,19 +47,6 @@ def test_jobs_done_in_the_last_step_terminate_and_do_not_truncate(make, play) ->
     steps, *_ = last()
     assert last() == last(steps) == (steps, True, False)
     assert last(steps - 1) == (steps - 1, False, True)
-
-
-def test_zenoh_and_memory_give_the_same_episode(make, play) -> None:
-    memory = make({"ticks": 12}, keep_events=True)
-    over_zenoh = make(
-        {"ticks": 12}, exchange=ZenohExchange(memory.possible_agents, fleet="same episode", timeout_s=120.0)
-    )
-    try:
-        traces = [[env.reset(seed=6), *play.go_on(env, np.random.default_rng(6))] for env in (memory, over_zenoh)]
-        assert play.plain(traces[0]) == play.plain(traces[1])
-        assert over_zenoh.messages == memory.messages > 0
-    finally:
-        over_zenoh.close()
 
 
 def test_the_fleet_is_rendered_as_text(make) -> None:

@@ -3,8 +3,7 @@
 import json
 import subprocess
 import sys
-import threading
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -31,7 +30,7 @@ from fleet.live import job_client
 from fleet.live.auction.rounds import planned_jobs
 from fleet.live.job_client import JobClient
 from tests import commands
-from tests.waiting import PATIENCE_S, serve_until
+from tests.waiting import PATIENCE_S, serve_until, serving
 
 JOB = JobSpec("a", "hold", ("rack",))
 
@@ -148,9 +147,9 @@ def test_whoever_forgets_a_job_hears_no_more_of_it(place):
     assert here.states() == [("a", "waiting"), ("b", "finished")]
 
 
-def test_to_ask_gets_a_reply_a_refusal_or_none(place, threads):
+def test_to_ask_gets_a_reply_a_refusal_or_none(place):
     here = place(by="mallory")
-    with threads(lambda: here.other.serve()):
+    with serving(here.other):
         with pytest.raises(Refused, match="No room"):
             here.client.submit_and_wait([JOB])
         key = keys.of_jobs("f", "status")
@@ -159,28 +158,7 @@ def test_to_ask_gets_a_reply_a_refusal_or_none(place, threads):
         here.link.ask(key, StatusRequest(), Status, timeout_s=0.1, attempts=3)
     here.other.close()
     with pytest.raises(NoReply, match="There is no auctioneer in this fleet"):
-        here.link.ask(key, StatusRequest(), Status, timeout_s=0.1, attempts=2)
-
-
-@pytest.fixture
-def threads():
-    @contextmanager
-    def run(turn):
-        stop = threading.Event()
-
-        def loop():
-            while not stop.wait(0.005):
-                turn()
-
-        thread = threading.Thread(target=loop)
-        thread.start()
-        try:
-            yield
-        finally:
-            stop.set()
-            thread.join()
-
-    return run
+        here.link.ask(key, StatusRequest(), Status, timeout_s=PATIENCE_S)
 
 
 def test_a_job_is_planned_once_an_arm_has_a_plan_or_every_arm_has_none():

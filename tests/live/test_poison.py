@@ -96,7 +96,7 @@ class Wire:
     def declare_token(self, key):
         pass
 
-    def tokens(self, expression, *, timeout_s):
+    def tokens(self, expression):
         return frozenset()
 
     def query(self, key, request, kind, done, *, timeout_s, each=lambda reply: None):

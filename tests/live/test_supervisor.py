@@ -82,18 +82,6 @@ def test_a_killed_process_is_restarted_while_its_child_holds_the_output_open(tmp
             os.killpg(supervisor.pid("a"), signal.SIGKILL)
 
 
-def test_a_killed_process_is_restarted(tmp_path):
-    with Supervisor(tmp_path, backoff=Backoff(first_s=0.05)) as supervisor:
-        supervisor.start(part("a", WAIT), ready_s=PATIENCE_S)
-        first = supervisor.pid("a")
-        os.kill(first, signal.SIGKILL)
-        supervisor.run(until(lambda: supervisor.restarts()["a"] == 1 and supervisor.ready("a")), poll_s=0.02)
-        second = supervisor.pid("a")
-        assert second not in (None, first)
-    assert exited(second)
-    assert supervisor.log("a").read_text() == "ready x\nready x\n"
-
-
 def test_a_process_that_always_fails_is_restarted_with_delays(tmp_path):
     start_s = time.monotonic()
     with Supervisor(tmp_path, backoff=Backoff(first_s=0.2, factor=2.0)) as supervisor:
@@ -255,7 +243,7 @@ with Supervisor(Path({folder!r}), program=("own",), main=lambda words: main(list
 def test_command_lines_of_the_program_are_forks_that_share_its_memory(tmp_path, end, code):
     import subprocess
 
-    script = FORKS.format(folder=str(tmp_path), wait=WAIT, end=end)
+    script = FORKS.format(folder=str(tmp_path), wait=SUPERVISED, end=end)
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=PATIENCE_S)
     assert (done.returncode, done.stdout.count("not written twice")) == (code, 1), done.stderr
     child, rss_kb, pss_kb = map(int, done.stdout.splitlines()[-1].split())

@@ -29,7 +29,7 @@ from fleet.bus.protocol.auction import (
     SubmissionReply,
 )
 from fleet.bus.protocol.cell import Cell, CellRequest
-from fleet.bus.protocol.messages import State, encode, encoding
+from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import (
     Cancel,
     Change,
@@ -43,7 +43,7 @@ from fleet.bus.protocol.operator import (
     Resume,
     Settle,
 )
-from fleet.bus.router import Router, open_client
+from fleet.bus.router import Router
 from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import issue, make
 from fleet.bus.security.tls import Tls
@@ -272,26 +272,6 @@ def test_nobody_else_may(fleet, command, who):
     assert "a certificate of the role" in str(done.exception)
     assert "operator" in str(done.exception)
     assert fleet.received == []
-
-
-@pytest.mark.parametrize("who", OTHERS)
-def test_the_router_drops_what_a_client_sends_against_its_role(fleet, who):
-    """Without our client's own check."""
-    fleet.received.clear()
-    messages = [
-        *((keys.of_jobs("f", "control"), ControlRequest(str(i), a)) for i, a in enumerate([Cancel("j"), Pause("*")])),
-        (keys.of_jobs("f", "clear"), ClearRequest(ARM, "ann")),
-        (keys.of_arm("f", ARM, "reset"), ResetRequest("ann")),
-    ]
-    session = open_client(fleet.endpoint(who), timeout_s=PATIENCE_S)
-    try:
-        for key, message in messages:
-            replies = session.get(key, payload=encode(message), encoding=encoding(type(message)), timeout=0.5)
-            assert [reply for reply in replies if reply.ok is not None] == []
-    finally:
-        session.close()
-    test_an_operator_may(fleet, ("arm", "pause"))  # whatever came before would have been served by now
-    assert len(fleet.received) == 1
 
 
 @pytest.mark.parametrize(("who", "may"), [("operator", True), ("submitter", True), ("b", False)])

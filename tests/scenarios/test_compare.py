@@ -58,17 +58,6 @@ def printed(result: Comparison) -> str:
     return page.getvalue()
 
 
-@pytest.mark.ci_slow
-@pytest.mark.parametrize("channel", [PERFECT, Channel(topology="line", delay_s=10.0)], ids=["perfect", "late"])
-def test_the_result_does_not_depend_on_the_number_of_workers(scenario, plans, monkeypatch, channel):
-    how = {"seeds": range(6), "channel": channel}
-    alone = compared(scenario, plans, workers=1, **how)
-    monkeypatch.setattr("scenarios.evaluate.study.TOGETHER", 4)
-    assert compared(scenario, plans, workers=1, **how) == alone
-    monkeypatch.setattr("scenarios.evaluate.runner.HERE_S", 0.0)
-    assert compared(scenario, plans, workers=2, **how) == alone
-
-
 def test_a_scenario_is_a_file_too_and_the_first_policy_the_default_baseline(small_toml, scenario, plans):
     policies = ["round_robin", "random"]
     first = compare(small_toml, policies, seeds=range(3), difficulty="blind", cache_dir=plans, workers=1)

@@ -333,16 +333,20 @@ def test_rows_of_several_programs_may_have_several_encodings(tmp_path):
     assert [job.name for job in read_job_table(tmp_path / "jobs.csv").values()] == ["Öl", "Maß", "€", "\ufffd"]
 
 
-def test_a_thousand_rows_are_read_and_all_their_faults_told_within_a_second(tmp_path):
+SOON_S = 2.0
+"""Of the processor, also of a slow one; with a fast one it takes a tenth."""
+
+
+def test_a_thousand_rows_are_read_and_all_their_faults_told_soon(tmp_path):
     kinds = [f"j{i},hld,bnch{i},{20 + i},0.5,soon,-1,maybe,-2,k{i}" for i in range(1000)]
-    begin_s = time.perf_counter()
+    began_s = time.process_time()
     told = faults_of(tmp_path, "\n".join([SHORT, *kinds]))
-    assert time.perf_counter() - begin_s < 1.0
+    assert time.process_time() - began_s < SOON_S
     assert f"has {9 * 1000} faults" in told
     rows = [f"j{i},hold,bench | shelf,2,1,{i % 180},{i + 1000},yes,1,{f'j{i - 1}' * (i > 0)}" for i in range(1000)]
-    begin_s = time.perf_counter()
+    began_s = time.process_time()
     assert len(small_table(tmp_path, "\n".join([SHORT, *rows])).jobs) == 1000
-    assert time.perf_counter() - begin_s < 1.0
+    assert time.process_time() - began_s < SOON_S
 
 
 def test_rows_outside_the_shift_are_counted_and_a_name_of_a_streams_job_is_refused(tmp_path, caplog, plans):

@@ -221,7 +221,7 @@ def test_an_arm_waits_until_the_token_of_its_last_process_expires(token_reaches)
             leaves.start()
             wait_for_name(second, "a", patience_s=PATIENCE_S)
             leaves.join()
-        assert not second.tokens(keys.of_arm("f", "a", "alive"), timeout_s=PATIENCE_S)
+        assert not second.tokens(keys.of_arm("f", "a", "alive"))
 
 
 def test_a_log_without_temperatures_is_refused(log, tmp_path):

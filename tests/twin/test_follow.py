@@ -142,7 +142,7 @@ def test_the_command_prints_a_line_per_window_until_ctrl_c(twin, motion, tmp_pat
             out.write("".join(lines[30:60]))
         second = process.stdout.readline()
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=60)
+        _, said = process.communicate(timeout=300)
     assert process.returncode == 130
     assert "windows of 0.96 s" in said
     begin = head.split(",").index("start_s")

@@ -103,7 +103,7 @@ def test_a_replayed_arm_publishes_d_and_expected_temperatures(twin, motion, tmp_
                 serve_until(lambda: states and states[-1].motion_difficulty is not None and states[-1].expected_c, link)
             finally:
                 process.send_signal(signal.SIGTERM)
-                process.communicate(timeout=60)
+                process.communicate(timeout=300)
     assert infos[-1].twin == f"d:{twin.version}+temperatures:{network.version}"
     assert 0 < (states[-1].motion_difficulty or 0) < 7
     shown = ArmSnapshot("a", True, True, joint=2, motion_difficulty=1.25, expected_c=(30.0, 41.5))

@@ -102,7 +102,7 @@ class ZenohExchange(Exchange):
         with ExitStack() as stack:
             endpoint = self._endpoint or stack.enter_context(Router()).endpoint
             client = stack.enter_context(BusClient(endpoint, self._fleet, timeout_s=self._timeout_s))
-            present = client.tokens(keys.of_every_arm(self._fleet, "alive"), timeout_s=self._timeout_s)
+            present = client.tokens(keys.of_every_arm(self._fleet, "alive"))
             if taken := sorted(present & set(self.arms)):
                 raise BusError(f"Fleet '{self._fleet}' already has {', '.join(taken)} on the bus at {endpoint}.")
             try:

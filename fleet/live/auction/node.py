@@ -111,6 +111,8 @@ class EpochCheck:
         return True
 
 
+OTHERS_S = 2.0
+"""Real seconds that another auctioneer has to reply at the start."""
 CHECK_S = 1.0
 """Real seconds between two checks for other auctioneers."""
 ALONE_S = 3.0
@@ -312,7 +314,7 @@ class AuctionNode(JobDesk):
         One that is stopped still shows its token, and one that is about to show it replies already.
         """
         fleet = self._link.fleet
-        tokens = self._link.tokens(keys.of_every_auction(fleet, "alive"), timeout_s=2.0)
+        tokens = self._link.tokens(keys.of_every_auction(fleet, "alive"))
         if self._name in tokens:
             raise BusError(
                 f"Fleet '{fleet}' has an auctioneer '{self._name}' already: its token is present. Stop that one first; "
@@ -323,9 +325,9 @@ class AuctionNode(JobDesk):
                 f"Fleet '{fleet}' has an auctioneer already: '{', '.join(sorted(tokens))}'. A fleet has one."
             )
         no_job = StatusRequest(("?",))
-        replies = self._link.query_and_wait(keys.of_jobs(fleet, "status"), no_job, Status, timeout_s=2.0)
+        replies = self._link.query_and_wait(keys.of_jobs(fleet, "status"), no_job, Status, timeout_s=OTHERS_S)
         for status in replies.messages.values():
-            if status.auctioneer in self._link.tokens(keys.of_every_arm(fleet, "alive"), timeout_s=2.0):
+            if status.auctioneer in self._link.tokens(keys.of_every_arm(fleet, "alive")):
                 raise BusError(
                     f"The arms of fleet '{fleet}' allocate the jobs themselves; '{status.auctioneer}' replies for "
                     "them. Stop them first."

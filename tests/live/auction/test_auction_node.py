@@ -1,8 +1,6 @@
 """An auctioneer over a real router: awards, requests of people, restarts, rivals and lost journals."""
 
 import re
-import threading
-import time
 from contextlib import ExitStack
 
 import pytest
@@ -37,7 +35,7 @@ from fleet.live.monitor.snapshot import FleetListener
 from fleet.live.policy_client import PolicyClient
 from scenarios.live.auctioneer import ON_BUS_S, CentralAllocation
 from tests.bus.test_policy_client import Server
-from tests.waiting import PATIENCE_S, wait_until
+from tests.waiting import PATIENCE_S, serving, wait_until
 
 TWICE = ("Started", "Started")
 """Of the owner, which compaction keeps, and of the start."""
@@ -314,7 +312,7 @@ def test_a_fleet_has_one_auctioneer(bus, token_reaches):
 
 
 @pytest.mark.ci_slow
-def test_a_participant_that_replies_without_a_token_counts_as_an_auctioneer(bus, token_reaches):
+def test_a_participant_that_replies_without_a_token_counts_as_an_auctioneer(bus, token_reaches, monkeypatch):
     early = bus.link()
     early.reply_to(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status("one", 0.0, ()))
     early.watch_tokens(keys.of_every_arm("f", "alive"), lambda *_: None)
@@ -322,15 +320,8 @@ def test_a_participant_that_replies_without_a_token_counts_as_an_auctioneer(bus,
     wait_until(lambda: probe.query_and_wait(keys.of_jobs("f", "status"), request, Status, timeout_s=2.0).refused)
     with pytest.raises(BusError, match="has an auctioneer already, which does not reply"):
         bus.auctioneer("two")
-    stop = threading.Event()
-
-    def serve():
-        while not stop.is_set():
-            early.serve(time.monotonic() + 0.05)
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    try:
+    monkeypatch.setattr(auction_node, "OTHERS_S", PATIENCE_S)
+    with serving(early):
         with pytest.raises(BusError, match="has an auctioneer already: 'one'"):
             bus.auctioneer("two")
         with bus.link() as arm:
@@ -338,9 +329,6 @@ def test_a_participant_that_replies_without_a_token_counts_as_an_auctioneer(bus,
             token_reaches(early, keys.of_arm("f", "one", "alive"))
             with pytest.raises(BusError, match=r"allocate the jobs themselves; 'one' replies .* Stop them first"):
                 bus.auctioneer("two")
-    finally:
-        stop.set()
-        thread.join(PATIENCE_S)
 
 
 def test_two_auctioneers_detect_each_other_and_accept_no_jobs(bus, monkeypatch):

@@ -105,7 +105,7 @@ def bus(tmp_path, small):
             deadline_s = time.monotonic() + PATIENCE_S
             while time.monotonic() < deadline_s:  # no arm may be ready to reply yet
                 got = []
-                outsider.query(key, request, kind, got.append, timeout_s=3.0)
+                outsider.query(key, request, kind, got.append, timeout_s=PATIENCE_S)
                 assert serve(partial(bool, got))
                 if got[0].messages:
                     return next(iter(got[0].messages.values()))
@@ -215,7 +215,7 @@ def test_all_jobs_of_a_common_stream_are_done(bus):
 def test_at_the_end_of_the_shift_last_cycles_are_completed_and_other_jobs_reported_unfinished(bus):
     stream = ((0.0, hold("brief", repetitions=1)), (0.0, hold("long", "rack", repetitions=10_000)))
     for name in ROSTER:
-        bus.arm(name, stream=stream, horizon_s=240.0)
+        bus.arm(name, stream=stream, horizon_s=600.0)
     assert bus.serve(lambda: all(one.work_source.over for one in bus.arms.values()))
     statuses = {each.job: each for each in bus.arms["arm_0"].work_source.statuses()}
     assert {name: each.state for name, each in statuses.items()} == {"brief": "finished", "long": "unfinished"}

@@ -195,7 +195,7 @@ async def receiver(replies, requests):
 def test_a_webhook_is_signed_and_repeated_until_it_is_accepted(monkeypatch):
     """A target that fails, and one that never replies, get the alarm again; the next alarm comes after it."""
     monkeypatch.setattr(webhooks, "RETRY_S", (0.01, 0.01, 0.01))
-    monkeypatch.setattr(webhooks, "REPLY_S", 0.2)
+    monkeypatch.setattr(webhooks, "REPLY_S", 1.0)
 
     async def run():
         requests = asyncio.Queue()
