@@ -1,6 +1,7 @@
 """Cache folders, and files that are written atomically."""
 
 import codecs
+import errno
 import os
 import re
 import shutil
@@ -77,8 +78,14 @@ def private_folder(path: Path) -> Path:
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a draft path beside `path`; the draft replaces `path` when the block ends without an error.
 
-    After an error `path` is as it was before, and the draft is removed.
+    After an error `path` is as it was before, and the draft is removed. Of a link, its target is replaced.
+
+    Raises:
+        OSError: `path` is a device or another special file.
     """
+    path = Path(os.path.realpath(path))
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OSError(errno.EINVAL, "it is no regular file", str(path))
     draft = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}")
     try:
         yield draft

@@ -1,7 +1,9 @@
 """Folders of results, written atomically: a reader finds either the complete folder or none."""
 
+import fcntl
 import json
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -34,7 +36,7 @@ def new_folder(out: Path, kind: ResultKind, *, overwrite: bool = False) -> Itera
     """A temporary folder that is renamed to `out` when the block succeeds, and removed when it fails.
 
     Raises:
-        FleetError: `out` cannot be written, or holds files that must not be replaced.
+        FleetError: `out` cannot be written, holds files that must not be replaced, or another process writes to it.
     """
     check_free(out, kind, overwrite=overwrite)
     target = Path(os.path.abspath(out))
@@ -43,16 +45,51 @@ def new_folder(out: Path, kind: ResultKind, *, overwrite: bool = False) -> Itera
         target.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
     try:
-        yield work
-        with disk_errors(out):
-            work.chmod(0o755)
-            replace_folder(work, target)
+        with lock_folder(work, out):
+            _remove_drafts(target, work, out)
+            yield work
+            check_free(out, kind, overwrite=overwrite)  # again: another process may have written it meanwhile
+            with disk_errors(out):
+                work.chmod(0o755)
+                replace_folder(work, target)
     finally:
         if work.exists():
             shutil.rmtree(work)
             for parent in created:
                 with suppress(OSError):  # another process has put a file there in the meantime
                     parent.rmdir()
+
+
+def _remove_drafts(target: Path, work: Path, out: Path) -> None:
+    """Remove the temporary folders of processes that were killed; raise a FleetError if another one is at work."""
+    draft = re.compile(re.escape(f".{target.name}.") + "[a-z0-9_]{8}")  # as `mkdtemp` names them
+    for other in target.parent.iterdir():
+        if draft.fullmatch(other.name) and other != work and other.is_dir():
+            with lock_folder(other, out), disk_errors(out):
+                shutil.rmtree(other)
+
+
+@contextmanager
+def lock_folder(folder: Path, out: Path | None = None) -> Iterator[None]:
+    """Lock a folder until the end of the block or of the process; no file is left in it.
+
+    Args:
+        out: For errors, if the user has given another folder.
+
+    Raises:
+        FleetError: another process has locked it, or it cannot be opened.
+    """
+    named = out or folder
+    with disk_errors(named):
+        handle = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise FleetError(f"Another process writes to '{named}'. Wait for it, or choose another --out.") from error
+        yield
+    finally:
+        os.close(handle)
 
 
 @contextmanager

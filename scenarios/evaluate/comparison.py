@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -70,6 +70,8 @@ class Comparison:
     """Normalised scores; None without references of the shifts."""
     randomise: Randomisation = field(default_factory=Randomisation)
     """Of every shift, the same for every policy."""
+    failed_baseline: str = ""
+    """The baseline that was asked for, if it failed: another one takes its place."""
 
     @property
     def title(self) -> str:
@@ -164,6 +166,8 @@ def compare(
         raise FleetError(f"Seed {twice[0]} is given twice: a repeated shift is no new evidence. Give each seed once.")
     if not policies or not seeds:
         raise FleetError(f"A comparison needs a policy and a seed (got {len(policies)} policies, {len(seeds)} seeds).")
+    if workers < 1 and workers != -1:
+        raise FleetError(f"workers must be >= 1, or -1 for one per core (got {workers}).")
     study = Study(
         policies=policies,
         cases=[Case(name=chosen.name, scenario=chosen, seeds=tuple(seeds))],
@@ -175,7 +179,7 @@ def compare(
     base = baseline or next(iter(study.competitors.values()))
     check_baseline(study, base)
     rows = run_study(study, cache_dir=cache_dir, workers=workers, progress=progress)
-    return comparison_of(study, rows, base)
+    return comparisons(study, rows, base)[0]
 
 
 def figures_of_shifts(
@@ -224,14 +228,19 @@ def comparisons(
 
     Args:
         rows: In the order of the study.
-        baseline: One of `Study.competitors`.
+        baseline: One of `Study.competitors`; if it failed, the first of those that did not takes its place.
         references: Of the shifts, for normalised scores.
     """
     check_baseline(study, baseline)
+    failed = {study.competitors[row.key.policy, row.key.difficulty] for row in rows if row.error is not None}
+    whole = [each for each in study.competitors.values() if each not in failed]
+    base = baseline if baseline in whole else next(iter(whole), baseline)
     if suite:
-        return [comparison_of(study, rows, baseline, suite_label(suite), references)]
-    of = {case.name: [row for row in rows if row.key.instance == case.name] for case in study.cases}
-    return [comparison_of(study, own, baseline, references=references) for own in of.values()]
+        results = [comparison_of(study, rows, base, suite_label(suite), references)]
+    else:
+        of = {case.name: [row for row in rows if row.key.instance == case.name] for case in study.cases}
+        results = [comparison_of(study, own, base, references=references) for own in of.values()]
+    return [replace(each, failed_baseline=baseline if baseline in failed else "") for each in results]
 
 
 def comparison_of(

@@ -4,9 +4,7 @@ A card states what makes rows comparable, hashes and settings. The same study co
 interruption, and does not continue in one with another card.
 """
 
-import fcntl
 import json
-import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +15,7 @@ from fleet.files import atomic_path
 from scenarios.evaluate.rollout import FIGURES
 from scenarios.evaluate.study import CARD, Row, RowKey, columns, row_of
 from scenarios.json_rows import Rows
-from scenarios.result_folder import disk_errors
+from scenarios.result_folder import disk_errors, lock_folder
 
 if TYPE_CHECKING:  # needs the extra `report`
     import pyarrow as pa
@@ -63,12 +61,7 @@ def opened(out: Path, card: Mapping[str, object]) -> Iterator[Store]:
         if out.exists() and not out.is_dir():
             raise FleetError(f"Cannot write to '{out}': it is a file; --out needs a folder.")
         out.mkdir(parents=True, exist_ok=True)
-        handle = os.open(out, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise FleetError(f"Another process writes to '{out}'. Wait for it, or choose another --out.") from error
+    with lock_folder(out):
         with disk_errors(out):
             whole = _joined(out, json.loads(json.dumps(card)))  # as a file gives it
             file = Rows(out / UNFINISHED)
@@ -79,8 +72,6 @@ def opened(out: Path, card: Mapping[str, object]) -> Iterator[Store]:
             _write_results(out, store.rows)
             (out / UNFINISHED).unlink(missing_ok=True)
             _write_card(out, {**whole, "status": "finished"})
-    finally:
-        os.close(handle)
 
 
 def _joined(out: Path, card: Mapping[str, Any]) -> dict[str, Any]:

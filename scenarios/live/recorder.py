@@ -5,7 +5,6 @@ row. Every sender numbers its messages: repeated ones are dropped, missing ones 
 publishers (`GapFetcher`), also those that a crash of the recorder lost, and lost ones become a row of `gaps`.
 """
 
-import fcntl
 import logging
 import math
 import os
@@ -45,7 +44,7 @@ from scenarios.live.recording import (
     to_row,
     to_table,
 )
-from scenarios.result_folder import json_text
+from scenarios.result_folder import disk_errors, json_text, lock_folder
 
 _LOG = logging.getLogger(__name__)
 
@@ -412,6 +411,8 @@ def record(
     Raises:
         FleetError: a disk error at the beginning or at the end; in between it is tried again.
     """
+    with disk_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
     with (
         lock_folder(folder),
         closing(RecorderNode(link, Recorder.open(folder, link.fleet), connect, rotate_s=rotate_s)) as node,
@@ -420,24 +421,3 @@ def record(
             node.serve()
         node.end()
     return node.recorder
-
-
-@contextmanager
-def lock_folder(folder: Path) -> Iterator[None]:
-    """Create the folder if it is missing, and lock it until the end of the block or of the process.
-
-    Raises:
-        FleetError: another process has locked it, or it cannot be created.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)  # the folder itself: no lock file is left in it
-    except OSError as error:
-        raise FleetError(f"Cannot write to '{folder}': {error.strerror}.") from error
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    except BlockingIOError as error:
-        raise FleetError(f"Another process records in '{folder}'. Stop it, or choose another --out.") from error
-    finally:
-        os.close(handle)

@@ -68,9 +68,17 @@ def result_text(result: Comparison) -> Group:
     for policy, count in Counter(each.policy for each in result.failures).most_common(MOST_TRACES):
         shifts = f"{label(policy)} failed in {count} shift{'s' * (count > 1)}, first in"
         parts.append(Text(f"\n{shifts} {_failure_text(first[policy])}\n{first[policy].trace}".rstrip()))
-    if not result.figures:
-        parts.append(Text(f"No differences: the baseline {label(result.baseline)} failed. Give another --baseline."))
+    if replaced := _replaced_baseline(result):
+        parts.append(Text(replaced))
     return Group(*parts)
+
+
+def _replaced_baseline(result: Comparison) -> str:
+    """That the baseline failed, and which policy takes its place; "" if it did not."""
+    if not result.failed_baseline:
+        return ""
+    instead = f"differences are to {label(result.baseline)}" if result.figures else "as every policy did"
+    return f"The baseline {label(result.failed_baseline)} failed: {instead}."
 
 
 def _illegal(results: Sequence[Comparison]) -> str:
@@ -177,6 +185,7 @@ def verdict(judged: Judged) -> list[str]:
     last = [f"Failed: {', '.join(sorted(map(label, failed)))}; a policy with a failed shift has no figures."] * bool(
         failed
     )
+    last += [each for each in [_replaced_baseline(judged.results[0])] if each]
     if values is None or scores is None:
         return [*_reward_verdict(judged.results), *last]
     best, *rest = ranked(scores)

@@ -35,9 +35,10 @@ from fleet.events import Event
 from fleet.live.job_rules import EXPIRED
 from fleet.robot import ThermalLimits
 from scenarios.cli.main import main
-from scenarios.live.recorder import Recorder, lock_folder, record
+from scenarios.live.recorder import Recorder, record
 from scenarios.live.recording import CARD, alarms_of, open_messages, part_files, read_card, read_parts, replay
 from scenarios.live.recording_report import heat_use, open_recording, order_events
+from scenarios.result_folder import lock_folder
 from scenarios.run.records import JobRecord, ShiftLog, schedule
 from scenarios.show.run_page import late_jobs, lateness_text, report_html, verdict
 from tests.profiles import examples
@@ -338,11 +339,8 @@ def test_a_replay_publishes_the_same_messages_and_refuses_names_of_present_arms(
 
 
 def test_two_recorders_cannot_share_a_folder(tmp_path):
-    rec = tmp_path / "rec"
-    with lock_folder(rec), pytest.raises(FleetError, match="Another process records"), lock_folder(rec):
-        pass
-    with lock_folder(rec):  # the first has ended
-        pass
+    with lock_folder(tmp_path), pytest.raises(FleetError, match="Another process writes to"):
+        record(None, tmp_path, rotate_s=1.0, stopped=lambda: True, connect=lambda: None)
 
 
 ARMS = ("arm_0", "arm_1")

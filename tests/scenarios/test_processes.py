@@ -314,6 +314,27 @@ def test_a_run_that_may_be_replaced_is(tmp_path, status, overwrite):
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
 
 
+def test_of_two_writers_of_a_folder_the_second_is_refused_and_what_a_killed_one_left_is_removed(tmp_path):
+    out, killed = tmp_path / "run", tmp_path / ".run.0a1b_2c3"
+    killed.mkdir()
+    (killed / "run.json").write_text("{}", encoding="utf-8")
+    kept = tmp_path / ".run.old.0a1b2c3d"  # of an earlier run that was being replaced
+    kept.mkdir()
+    with new_folder(out, RUN) as work:
+        assert set(tmp_path.iterdir()) == {work, kept}
+        with pytest.raises(FleetError, match="Another process writes to '.*run'. Wait for it"), new_folder(out, RUN):
+            pass
+        assert set(tmp_path.iterdir()) == {work, kept}
+    assert set(tmp_path.iterdir()) == {out, kept}
+
+
+def test_a_run_that_another_process_has_written_meanwhile_is_not_replaced(tmp_path):
+    out = tmp_path / "run"
+    with pytest.raises(FleetError, match="holds a finished run"), new_folder(out, RUN):
+        an_earlier_run(out, "finished")
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+
+
 def test_a_finished_run_is_not_replaced_unasked_and_a_file_in_the_way_is_named(tmp_path):
     an_earlier_run(tmp_path / "run", "finished")
     file = tmp_path / "file"

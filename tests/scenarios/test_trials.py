@@ -3,12 +3,14 @@
 import subprocess
 import sys
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from rich.console import Console
 
 from agents.pairs import PARAMETERS, save_pairs
 from fleet.errors import FleetError
@@ -20,6 +22,7 @@ from scenarios.evaluate.study import Case, Row, RowKey, Study, Unit, policy_hash
 from scenarios.prepare import fleet as preparing
 from scenarios.prepare.arms import plan_arms
 from scenarios.prepare.fleet import prepare
+from scenarios.policy_loader import label
 from scenarios.processes import Queue
 from scenarios.show.comparison_page import result_text
 from scenarios.spec.load import load
@@ -187,9 +190,12 @@ def test_policies_that_fail_are_told_and_the_others_go_on(scenario, plans, bad, 
     result = comparison_of(study, rows, "round_robin")
     assert set(result.figures) == {"round_robin", names["Illegal"], names["Idle"]}
     assert {(each.policy, each.seed) for each in result.failures} == {(names[n], s) for n in said for s in (0, 1)}
-    failed = comparison_of(study, rows, names["Raises"])
-    assert not failed.figures
-    assert result_text(failed)
+    (again,) = comparisons(study, rows, names["Raises"])  # which failed: the first that did not takes its place
+    assert (again.baseline, again.failed_baseline) == ("round_robin", names["Raises"])
+    assert replace(again, failed_baseline="") == result
+    shown = StringIO()
+    Console(file=shown, width=200).print(result_text(again))
+    assert f"The baseline {label(names['Raises'])} failed: differences are to round_robin." in shown.getvalue()
 
 
 @pytest.mark.ci_slow
