@@ -349,7 +349,7 @@ class BatchEnv:
         """Begin given shifts in some envs, with their observations in `parts`.
 
         Args:
-            sensors: Seed of the sensors of each shift, from which delays and losses of messages follow; not read without
+            sensors: Seed of the sensors of each shift, from which delays and losses of messages follow; only read with
                 exchanges.
         """
         self.engine.reset(rows, shifts)

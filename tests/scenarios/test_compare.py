@@ -239,12 +239,12 @@ def test_the_page_says_who_beats_whom_and_loads_nothing(study: Study):
         go.Figure(json.loads(figure))  # raises on any property or value that Plotly does not know
 
 
-def test_a_baseline_that_failed_has_no_differences(study: Study):
+def test_the_first_policy_that_did_not_fail_takes_the_place_of_a_baseline_that_did(study: Study):
     about = judged(study, rows_of(study, "Oops", failing="wspt"), KNOWN_SHIFTS)
-    without, failed = verdict(about)
-    assert without.endswith("no differences, as the baseline wspt failed.")
+    *_, failed, replaced = verdict(about)
     assert failed.startswith("Failed: wspt;")
-    assert "Normalised score" not in comparison_page(about)
+    assert replaced == "The baseline wspt failed: differences are to wsept."
+    assert "Normalised score" in comparison_page(about)
 
 
 def test_the_best_of_several_must_be_significant_among_them(study: Study):

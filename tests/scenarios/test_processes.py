@@ -322,7 +322,7 @@ def test_of_two_writers_of_a_folder_the_second_is_refused_and_what_a_killed_one_
     kept.mkdir()
     with new_folder(out, RUN) as work:
         assert set(tmp_path.iterdir()) == {work, kept}
-        with pytest.raises(FleetError, match="Another process writes to '.*run'. Wait for it"), new_folder(out, RUN):
+        with pytest.raises(FleetError, match=r"Another process writes to '.*run'\. Wait for it"), new_folder(out, RUN):
             pass
         assert set(tmp_path.iterdir()) == {work, kept}
     assert set(tmp_path.iterdir()) == {out, kept}

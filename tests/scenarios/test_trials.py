@@ -19,10 +19,10 @@ from scenarios.evaluate.comparison import comparison_of, comparisons
 from scenarios.evaluate.rollout import FIGURES, outcomes
 from scenarios.evaluate.store import RESULTS, UNFINISHED, opened, read_rows
 from scenarios.evaluate.study import Case, Row, RowKey, Study, Unit, policy_hash, seeds_of_instance
+from scenarios.policy_loader import label
 from scenarios.prepare import fleet as preparing
 from scenarios.prepare.arms import plan_arms
 from scenarios.prepare.fleet import prepare
-from scenarios.policy_loader import label
 from scenarios.processes import Queue
 from scenarios.show.comparison_page import result_text
 from scenarios.spec.load import load

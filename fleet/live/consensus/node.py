@@ -250,7 +250,7 @@ class ConsensusNode(JobDesk):
         self._declare_desk(link)
         link.subscribe(keys.of_every_arm(fleet, "bid"), Bid, self._apply_bid, history=True)
         link.subscribe(keys.of_every_arm(fleet, "state"), State, self.participant.apply_state)
-        self._at_start = link.tokens(keys.of_every_arm(fleet, "alive"), timeout_s=REPLY_S)
+        self._at_start = link.tokens(keys.of_every_arm(fleet, "alive"))
         self._listened_s = time.monotonic() + LISTEN_S
         link.watch_tokens(keys.of_every_arm(fleet, "alive"), self._apply_token)
 
