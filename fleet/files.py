@@ -83,7 +83,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     Raises:
         OSError: `path` is a device or another special file.
     """
-    path = Path(os.path.realpath(path))
+    path = path.resolve()
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise OSError(errno.EINVAL, "it is no regular file", str(path))
     draft = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}")

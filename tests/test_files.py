@@ -28,6 +28,19 @@ def test_a_file_is_replaced_when_the_block_ends(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_of_a_link_the_target_is_replaced_and_a_special_file_is_refused(tmp_path):
+    path, link, pipe = tmp_path / "plan.bin", tmp_path / "link", tmp_path / "pipe"
+    link.symlink_to(path)
+    with atomic_path(link) as draft:  # also one whose target does not exist yet
+        draft.write_bytes(b"new")
+    assert link.is_symlink()
+    assert path.read_bytes() == b"new"
+    os.mkfifo(pipe)
+    with pytest.raises(OSError, match="no regular file"), atomic_path(pipe):
+        pass
+    assert set(tmp_path.iterdir()) == {path, link, pipe}
+
+
 def test_after_an_error_the_file_is_unchanged_and_the_draft_is_gone(tmp_path):
     path = tmp_path / "plan.bin"
     path.write_bytes(b"old")

@@ -232,6 +232,12 @@ class DiskPath:
     def touch(self, mode: int = 0o666) -> None:
         self.disk.close(self.disk.open(self, 0, mode))
 
+    def resolve(self) -> "DiskPath":
+        return self  # there are no links
+
+    def is_file(self) -> bool:
+        return self.exists() and not self.is_dir()
+
     def is_dir(self) -> bool:
         return self.name == ""
 
