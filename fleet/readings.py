@@ -5,7 +5,7 @@ in `fleet/data/gen3_thermal.json`. Limits of the statistics leave room around 34
 """
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import resources
@@ -61,6 +61,13 @@ MISFIT = 0.05
 """Share of the squared torque that gravity leaves unexplained in a wrong log; of the public logs only one has more."""
 BETTER = 3.0
 """Factor by which another reading of the log must reduce that share before it is named; at most 1.1 in that log."""
+SLOW_RAD_S = 0.2
+"""Speed up to which gravity causes most of the torque."""
+UNHELD, UNHELD_NM = 0.35, 0.8
+"""Share of the squared torque, and RMS torque, that no mount and payload of a Gen3 leave unexplained. The public logs
+have a share of at most 0.11; with a tenth of their torque it is at least 0.5."""
+MOST_PAYLOAD_KG = 5.0
+"""Largest payload with which torques are explained."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +217,7 @@ def judge(time_s: Array, readings: Mapping[str, Array], *, degrees: bool, measur
         *_motion(time_s[good], sound, degrees),
         *_currents(sound),
         *_upright(sound, degrees),
-        *_gravity(sound),
+        *(list(_gravity(sound)) or unheld(sound)),
     ]
 
 
@@ -517,18 +524,74 @@ def gravity_terms(q: Array) -> Array:
 
 def _gravity(readings: Mapping[str, Array]) -> Iterator[BadReading]:
     """Torques that no mount and payload explain, but another order, unit or sign of the joints does."""
-    slow = np.flatnonzero(np.abs(readings["qd"]).max(axis=1) < 0.2)
-    if len(slow) < 10:
-        return
-    rows = slow[np.linspace(0, len(slow) - 1, 60).astype(int)]
-    q, tau = readings["q"][rows], readings["tau"][rows]
-    if np.sqrt((tau**2).mean(axis=0)).max() < LEAST_TORQUE_NM or (misfit := _misfit(q, tau)) < MISFIT:
+    q, tau = _slow(readings)
+    if len(q) < 10 or np.sqrt((tau**2).mean(axis=0)).max() < LEAST_TORQUE_NM or (misfit := _misfit(q, tau)) < MISFIT:
         return
     alternatives = [(_misfit(q_, tau_), meant) for q_, tau_, meant in _alternatives(q, tau)]
     least, meant = min(alternatives, key=lambda each: each[0])
     if least * BETTER < misfit:
         what = f"the torques do not fit the angles: gravity leaves {misfit:.0%} of the squared torque unexplained"
         yield BadReading(what, f"With {meant} it would be {least:.0%}. Check the columns, signs and units.")
+
+
+def _slow(readings: Mapping[str, Array]) -> tuple[Array, Array]:
+    """Angles and torques of at most 60 rows with little motion, [row, joint]."""
+    slow = np.flatnonzero(np.abs(readings["qd"]).max(axis=1) < SLOW_RAD_S)
+    rows = slow if len(slow) < 10 else slow[np.linspace(0, len(slow) - 1, 60).astype(int)]
+    return readings["q"][rows], readings["tau"][rows]
+
+
+def unheld(readings: Mapping[str, Array]) -> list[BadReading]:
+    """Torques that no Gen3 has at rest in these postures, in any mount and with any payload.
+
+    Args:
+        readings: `q` rad, `qd` rad/s, `tau` N·m, [row, joint].
+    """
+    q, tau = _slow(readings)
+    if not len(q) or _unexplained([(q, tau)]) < UNHELD:
+        return []
+    rms_nm = np.sqrt((tau**2).mean())
+    what = f"the torques, {rms_nm:.3g} N·m RMS, do not hold the arm: in every mount, gravity needs others"
+    tenfold_fits = _unexplained([(q, 9.81 * tau)]) < UNHELD
+    guess = "Are these kgf·m, or currents in A? " if tenfold_fits else "Was the torque measured? "
+    return [BadReading(what, f"{guess}Give N·m.")]
+
+
+def mounts_differ(*several: Mapping[str, Array]) -> bool:
+    """Whether no single mount explains the torques of several logs of one arm, with a payload each.
+
+    Args:
+        several: `q` rad, `qd` rad/s, `tau` N·m, [row, joint].
+    """
+    return _unexplained([(q, tau) for q, tau in map(_slow, several) if len(q)]) > UNHELD
+
+
+def _unexplained(parts: Sequence[tuple[Array, Array]]) -> float:
+    """Share of the squared torque that gravity leaves unexplained in the best mount, of the worst part.
+
+    Args:
+        parts: Angles, rad, and torques, N·m, [row, joint], each with a payload of its own.
+    """
+    mounts, kg = _mounts(), np.arange(0.0, MOST_PAYLOAD_KG + 0.1, 0.5)
+    factors = np.concatenate(np.broadcast_arrays(mounts[:, None], mounts[:, None] * kg[:, None]), axis=-1)
+    worst = np.zeros(len(mounts))
+    for q, tau in parts:
+        terms, torque = gravity_terms(q).reshape(-1, 6), tau.ravel()
+        needed = ((factors @ (terms.T @ terms)) * factors).sum(axis=-1)
+        left = np.maximum(needed - 2.0 * factors @ (terms.T @ torque) + torque @ torque, 0.0)  # [mount, payload]
+        share = left / np.maximum(np.maximum(needed, torque @ torque), 1e-9)
+        share[left < len(torque) * UNHELD_NM**2] = 0.0
+        worst = np.maximum(worst, share.min(axis=1))
+    return float(worst.min(initial=np.inf))
+
+
+@cache
+def _mounts(count: int = 600) -> Array:
+    """Evenly distributed directions of gravity (Fibonacci lattice), [mount, 3]."""
+    middle = np.arange(count) + 0.5
+    height, angle = 1.0 - 2.0 * middle / count, middle * np.pi * (3.0 - np.sqrt(5.0))
+    radius = np.sqrt(1.0 - height**2)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height])
 
 
 def _misfit(q: Array, tau: Array) -> float:

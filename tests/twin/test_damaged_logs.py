@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from fleet.arm.model import ArmModel
 from fleet.errors import LogError
-from fleet.readings import BadReading, gravity_terms, judge, most_temp_change_k, possible_temperatures
+from fleet.readings import BadReading, gravity_terms, judge, most_temp_change_k, mounts_differ, possible_temperatures
 from fleet.robot import Robot
 from twin.logs.reader import read
 from twin.logs.recording import READINGS, stretches
@@ -403,12 +403,48 @@ def test_coarse_recorders_and_slow_ones_are_not_refused(channel: str, digits: in
     """Most readings of such a channel repeat: no sensor is dead for that."""
     time_s = np.arange(0.0, 900.0, 0.5)
     q = 0.4 * np.sin(np.outer(time_s, 0.1 * np.arange(1, 8)) + np.arange(7))
-    readings = {"q": q, "qd": np.gradient(q, time_s, axis=0), "tau": 2.0 * np.cos(q), "temp_c": 31.0 + 0.2 * np.sin(q)}
+    tau = gravity_terms(q)[:, :, 2] + 0.1 * np.cos(q)
+    readings = {"q": q, "qd": np.gradient(q, time_s, axis=0), "tau": tau, "temp_c": 31.0 + 0.2 * np.sin(q)}
     readings["current_a"] = 0.1 * readings["tau"]
     readings[channel] = readings[channel].round(digits)
     assert judge(time_s, readings, degrees=False) == []
     slow = {name: values[::4] for name, values in readings.items()}
     assert judge(time_s[::4], slow, degrees=False) == []
+
+
+UNHELD: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
+    "zero": (lambda tau: 0.0 * tau, "Was the torque measured?"),
+    "kgf·m": (lambda tau: tau / 9.81, "Are these kgf·m"),
+    "amperes": (lambda tau: tau / TORQUE_PER_AMP, "currents in A"),
+    "noise": (lambda tau: np.random.default_rng(0).normal(0.0, 3.0, tau.shape), "Was the torque measured?"),
+}
+
+
+@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize("name", UNHELD)
+def test_a_torque_that_does_not_hold_the_arm_is_refused(name: str, measured: bool, tmp_path: Path) -> None:
+    """Of a log and of a plan: with it, a forecast would be far too cool."""
+    log, (change, question) = sound(kg=0.0), UNHELD[name]
+    path = tmp_path / "log.csv"
+    path.write_text(log.text(), encoding="utf-8")
+    assert read(path, measured=measured)
+    log.groups["Torque"] = change(log.groups["Torque"])
+    log = log.plain()
+    log.groups.pop("Current")
+    path.write_text(log.text([each for each in PLAIN_NAMES if "current" not in each]), encoding="utf-8")
+    with pytest.raises(LogError, match="do not hold the arm") as refused:
+        read(path, measured=measured)
+    assert question in str(refused.value)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_log_and_a_plan_of_one_arm_have_one_mount(sign: float) -> None:
+    """With the other sign the arm would hang from the ceiling."""
+    parts = []
+    for start, factor in ((START, 1.0), (START[::-1], sign)):
+        q = start + 0.3 * np.sin(np.linspace(0.0, 5.0, 50))[:, None]
+        parts.append({"q": q, "qd": 0.0 * q, "tau": factor * gravity_terms(q)[:, :, 2]})
+    assert mounts_differ(*parts) == (sign < 0)
 
 
 def test_a_planned_motion_has_no_sensors(tmp_path: Path) -> None:

@@ -33,16 +33,16 @@ TIME_S = (0.0, 0.5, 1.1, 1.5)
 
 
 def gen3_row(time_s: float) -> list[str]:
-    """Joint k (1..7) at k degrees below zero, 20 + k °C, k N·m on the joint with some noise, −k/10 A, k/100 °/s."""
+    """Joint k (1..7) at k degrees below zero, 20 + k °C, k/10 N·m on the joint with some noise, −k/10 A, k/100 °/s."""
     k = np.arange(1, 8)
-    numbers = [time_s, *(360.0 - k), *(20.0 + k), *((1 + 1e-9 * time_s) * k), *(-0.1 * k), *(0.01 * k)]
+    numbers = [time_s, *(360.0 - k), *(20.0 + k), *((0.1 + 1e-9 * time_s) * k), *(-0.1 * k), *(0.01 * k)]
     return [repr(float(n)) for n in numbers]
 
 
 def plain_row(time_s: float) -> list[str]:
     """The same in SI with our signs."""
     k = np.arange(1, 8)
-    numbers = [time_s, *np.deg2rad(-k), *np.deg2rad(0.01 * k), *(-1.0 * k), *(-0.1 * k), *(20.0 + k)]
+    numbers = [time_s, *np.deg2rad(-k), *np.deg2rad(0.01 * k), *(-0.1 * k), *(-0.1 * k), *(20.0 + k)]
     return [repr(float(n)) for n in numbers]
 
 
@@ -82,7 +82,13 @@ def test_all_formats_say_the_same_in_si(tmp_path: Path, gen3: Callable[..., Path
         (recording,) = read(path)
         assert (recording.name, recording.dropped) == (name, ())
         np.testing.assert_allclose(recording.time_s, TIME_S)
-        expected = {"q": np.deg2rad(-k), "qd": np.deg2rad(k / 100), "tau": -k, "current_a": -k / 10, "temp_c": 20 + k}
+        expected = {
+            "q": np.deg2rad(-k),
+            "qd": np.deg2rad(k / 100),
+            "tau": -k / 10,
+            "current_a": -k / 10,
+            "temp_c": 20 + k,
+        }
         for channel, values in expected.items():
             np.testing.assert_allclose(getattr(recording, channel), values, atol=1e-12)
 
@@ -105,7 +111,7 @@ def test_columns_may_come_in_any_order_and_currents_and_temperatures_may_lack(tm
     path = tmp_path / "short.csv"
     path.write_text("\ufeff" + text([f'"{PLAIN[i]}"' for i in order], rows, "\n"), encoding="utf-8")
     (recording,) = read(path)
-    np.testing.assert_allclose(recording.tau[0], -np.arange(1.0, 8.0))
+    np.testing.assert_allclose(recording.tau[0], -np.arange(1.0, 8.0) / 10)
     assert recording.current_a is recording.temp_c is None
 
 
@@ -309,14 +315,16 @@ def test_the_recorder_in_the_documentation_writes_a_gen3_log(tmp_path: Path):
     exec(code, space)
     k = iter(range(1, 8))
     actuators = [
-        SimpleNamespace(position=360.0 - i, temperature_motor=20.0 + i, torque=i, current_motor=-0.1 * i, velocity=i)
+        SimpleNamespace(
+            position=360.0 - i, temperature_motor=20.0 + i, torque=0.1 * i, current_motor=-0.1 * i, velocity=i
+        )
         for i in k
     ]
     arm = SimpleNamespace(RefreshFeedback=lambda: SimpleNamespace(actuators=actuators))
     space["record"](arm, tmp_path / "own.csv", duration_s=0.01, rate_hz=1e6)
     (own,) = read(tmp_path / "own.csv")
     np.testing.assert_allclose(own.q[0], np.deg2rad(-np.arange(1.0, 8.0)))
-    np.testing.assert_allclose(own.tau[0], -np.arange(1.0, 8.0))
+    np.testing.assert_allclose(own.tau[0], -np.arange(1.0, 8.0) / 10)
     np.testing.assert_allclose(own.temp_c[-1], 20 + np.arange(1.0, 8.0))
 
 

@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 
 from fleet.errors import LogError, nearest
 from fleet.files import decode_text
-from fleet.readings import judge, repeats
+from fleet.readings import judge, repeats, unheld
 from fleet.robot import JOINTS
 from twin.logs.recording import GAP_S, READINGS, Recording
 
@@ -458,7 +458,7 @@ def read(path: str | Path, *, damaged: Damaged = "refuse", measured: bool = True
     Args:
         damaged: "refuse" raises on any unusable line; "skip" drops such lines, logs a warning, and lists them in
             `Recording.dropped`.
-        measured: Whether sensors made a CSV log; of a planned motion only ranges are judged.
+        measured: Whether sensors made a CSV log; of a planned motion only ranges and gravity are judged.
 
     Raises:
         LogError: file, line and reason.
@@ -582,6 +582,8 @@ def _recording(
     good = {channel: values[rows] for channel, values in readings.items()}
     dropped_lines = {d.line for d in damage}
     bad = judge(time_s[rows], good, degrees=layout.turns, measured=is_csv and measured)
+    if is_csv and not measured and not bad:
+        bad = unheld(good)
     if part and damaged == "skip":
         bad = [replace(found, most=False) for found in bad]
     for found in sorted(bad, key=lambda found: not found.whole):
