@@ -140,6 +140,15 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
     return since(begin, date if date.tzinfo else date.replace(tzinfo=begin.tzinfo))
 
 
+def _job_time(cell: Cell, dialect: _Dialect) -> float:
+    """As `_seconds`; with the begin of the shift as a date, not before it."""
+    if (time_s := _seconds(cell, dialect)) < 0 and (begin := dialect.begin):
+        date = (begin.astimezone(UTC) + timedelta(seconds=time_s)).astimezone(begin.tzinfo)
+        form = "%d %b %Y %H:%M"
+        raise ValueError(f"{date:{form}} is before the shift, which begins on {begin:{form}} (got {_shown(cell)})")
+    return time_s
+
+
 def since(begin: datetime, date: datetime) -> float:
     """Time from one date to another, s; within one zone, the difference of dates would ignore summer time."""
     return (date.astimezone(UTC) - begin.astimezone(UTC)).total_seconds()
@@ -205,8 +214,8 @@ _COLUMNS: Mapping[str, tuple[str, Callable[[Cell, _Dialect], object], object]] =
     "places": ("every_places", _places, ()),
     "payload": ("payload_kg", _number, 0.0),
     "repetitions": ("repetitions", _count, 1),
-    "release": ("release_s", _seconds, 0.0),
-    "due": ("due_s", _seconds, None),
+    "release": ("release_s", _job_time, 0.0),
+    "due": ("due_s", _job_time, None),
     "hard": ("expires", _flag, False),
     "value": ("value", _number, 1.0),
     "after": ("after", _names, ()),
@@ -568,5 +577,10 @@ def shift_begin(given: object, where: str, zone: tzinfo | None = None) -> dateti
     if begin in (None, ""):
         return None
     if isinstance(begin, datetime) and (begin.tzinfo or zone) and YEARS[0] <= begin.year <= YEARS[1]:
-        return begin.replace(tzinfo=begin.tzinfo or zone).astimezone(zone or begin.tzinfo)
+        begin = begin.replace(tzinfo=begin.tzinfo or zone)
+        if begin.astimezone(UTC).astimezone(begin.tzinfo).replace(tzinfo=None) != begin.replace(tzinfo=None):
+            raise ScenarioError(
+                f"{where} = {given} does not exist: summer time leaves out this hour. Give another time."
+            )
+        return begin.astimezone(zone or begin.tzinfo)
     raise ScenarioError(f"{where} must be {DATE} (got {given}).")

@@ -266,6 +266,10 @@ def test_what_a_german_spreadsheet_writes_is_read_or_asked_about(tmp_path):
     assert not second.expires
     for row, sentence in (
         ("a;hold;bench;;1.000;;;;;", "column repetitions: is this 1000? Give numbers without separators of thousands"),
+        (
+            "a;hold;bench;;;22.11.2026 6:00;;;;",
+            "column release: 22 Nov 2026 06:00 is before the shift, which begins on 23 ",
+        ),
         ("a;hold;bench;;;6:01;5:00;;;", "column due: '5:00' is outside the shift, which begins at 06:00 and"),
     ):
         assert sentence in faults_of(tmp_path, f"{SHORT.replace(',', ';')}\n{row}\n", begin)
