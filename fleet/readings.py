@@ -61,6 +61,8 @@ MISFIT = 0.05
 """Share of the squared torque that gravity leaves unexplained in a wrong log; of the public logs only one has more."""
 BETTER = 3.0
 """Factor by which another reading of the log must reduce that share before it is named; at most 1.1 in that log."""
+BACK = 0.05
+"""Share of lines across which an angle jumps back, from which a log has two arms; the public logs have none."""
 SLOW_RAD_S = 0.2
 """Speed up to which gravity causes most of the torque."""
 UNHELD, UNHELD_NM = 0.35, 0.8
@@ -198,7 +200,7 @@ def judge(time_s: Array, readings: Mapping[str, Array], *, degrees: bool, measur
     if not measured:
         return bad
     unit = _wrong_unit(readings["temp_c"]) if "temp_c" in readings else ()
-    bad = [*judge_time(time_s), *unit, *bad]
+    bad = [*judge_time(time_s), *unit, *bad, *_interleaved(time_s, readings)]
     if any(found.whole for found in bad):
         return bad
     bad += _stuck(time_s, readings)
@@ -374,18 +376,50 @@ def _impossible_changes(time_s: Array, temp_c: Array) -> Iterator[BadReading]:
     possible = possible_temperatures(time_s, temp_c)
     for j in np.flatnonzero(~possible.all(axis=0)):
         for a, b in runs(~possible[:, j]):
-            beside = a - 1 if a else min(b, len(time_s) - 1)
-            dt_s = abs(time_s[a] - time_s[beside])
+            edges = [(a, a - 1)] * (a > 0) + [(b - 1, b)] * (b < len(time_s)) or [(a, a)]
+            row, beside = max(edges, key=lambda edge: _excess(time_s, temp_c, j, *edge))
+            dt_s = abs(time_s[row] - time_s[beside])
             what = (
-                f"temperature of joint {j + 1} jumps: {temp_c[a, j]:.5g} °C beside {temp_c[beside, j]:.5g} °C within "
+                f"temperature of joint {j + 1} jumps: {temp_c[row, j]:.5g} °C beside {temp_c[beside, j]:.5g} °C within "
                 f"{dt_s:.3g} s, where a motor changes by at most {most_temp_change_k(dt_s)[j]:.2g} K"
             )
             yield BadReading(what, "Did its sensor fail?", np.arange(a, b))
 
 
+def _excess(time_s: Array, temp_c: Array, joint: np.intp, row: int, other: int) -> float:
+    """Change of a motor temperature between two rows beyond the largest possible one, K."""
+    allowed_k = most_temp_change_k(abs(time_s[row] - time_s[other]))[joint]
+    return float(abs(temp_c[row, joint] - temp_c[other, joint]) - allowed_k)
+
+
 def _steps(q: Array) -> Array:
     """Change of the angles by at most half a turn, rad, [row − 1, joint]."""
     return (np.diff(q, axis=0) + np.pi) % (2 * np.pi) - np.pi
+
+
+def _interleaved(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]:
+    """Angles that jump there and back, unlike the velocities, as in a file with the lines of two arms."""
+    dt_s, moved, qd = np.diff(time_s), _steps(readings["q"]), readings["qd"]
+    if len(time_s) < LEAST_ROWS or np.median(dt_s) > MOST_MOTION_STEP_S:
+        return
+    apart = np.abs(moved - (qd[1:] + qd[:-1]) / 2.0 * dt_s[:, None])
+    jumps = (apart > LEAST_MOTION_RAD) & (np.abs(moved) > LEAST_MOTION_RAD)
+    back = [np.count_nonzero(np.diff(np.sign(moved[jumps[:, j], j]))) for j in range(JOINTS)]
+    if max(back) > BACK * len(time_s):
+        what = f"the angle of joint {np.argmax(back) + 1} jumps back and forth {max(back)} times, unlike its velocity"
+        yield BadReading(what, "Are two arms in one log? Write a file for each arm.")
+
+
+def clock_step(time_s: Array, temp_c: Array) -> int | None:
+    """Row after a step of an hour across which no motor temperature changes, as if a clock was put forward.
+
+    Args:
+        time_s: Increasing, [row].
+        temp_c: [row, joint].
+    """
+    dt_s, change_k = np.diff(time_s), np.abs(np.diff(temp_c, axis=0)).max(axis=1)
+    steps = np.flatnonzero((np.abs(dt_s - 3600.0) < MOST_STEP_S) & (change_k < TEMP_STEP_K))
+    return int(steps[0]) + 1 if len(steps) else None
 
 
 def _motion(time_s: Array, readings: Mapping[str, Array], degrees: bool) -> Iterator[BadReading]:

@@ -15,7 +15,15 @@ from hypothesis import strategies as st
 
 from fleet.arm.model import ArmModel
 from fleet.errors import LogError
-from fleet.readings import BadReading, gravity_terms, judge, most_temp_change_k, mounts_differ, possible_temperatures
+from fleet.readings import (
+    BadReading,
+    _impossible_changes,
+    gravity_terms,
+    judge,
+    most_temp_change_k,
+    mounts_differ,
+    possible_temperatures,
+)
 from fleet.robot import Robot
 from twin.logs.reader import read
 from twin.logs.recording import READINGS, stretches
@@ -410,6 +418,40 @@ def test_coarse_recorders_and_slow_ones_are_not_refused(channel: str, digits: in
     assert judge(time_s, readings, degrees=False) == []
     slow = {name: values[::4] for name, values in readings.items()}
     assert judge(time_s[::4], slow, degrees=False) == []
+
+
+@pytest.mark.parametrize("rows", [1, 5])
+@pytest.mark.parametrize("damaged", ["refuse", "skip"])
+def test_the_lines_of_two_arms_in_one_file_are_named(rows: int, damaged: str, tmp_path: Path) -> None:
+    """Alternately, and in blocks: nothing of them is read."""
+    one, other = sound(), sound(start=-START, seed=1)
+    second = np.arange(ROWS) // rows % 2 == 1
+    for group, values in one.groups.items():
+        values[second] = other.groups[group][second]
+    (tmp_path / "log.csv").write_text(one.text(), encoding="utf-8")
+    with pytest.raises(LogError, match=r"jumps back and forth .* Are two arms in one log"):
+        read(tmp_path / "log.csv", damaged=damaged)
+
+
+@pytest.mark.parametrize(("step_s", "colder_k"), [(3600.0, 0.0), (3600.0, 5.0), (1800.0, 0.0)])
+def test_a_clock_put_forward_an_hour_is_told(step_s: float, colder_k: float, tmp_path: Path, caplog) -> None:
+    log = sound()
+    log.time_s[150:] += step_s
+    log.groups["Temp"][150:] -= colder_k
+    (tmp_path / "log.csv").write_text(log.text(), encoding="utf-8")
+    with caplog.at_level(logging.WARNING):
+        read(tmp_path / "log.csv")
+    assert ("line 152: time steps by 3600 s" in caplog.text) == (step_s == 3600.0 and not colder_k)
+
+
+def test_a_jump_is_told_beside_the_reading_that_it_contradicts() -> None:
+    """A group of readings before the longest one contradicts the readings behind it, not those before it."""
+    time_s, temp_c = np.arange(0.0, 60.0), np.full((60, 7), 35.0) + 0.01 * np.arange(60.0)[:, None]
+    time_s[10:] += 456.0
+    temp_c[10:15, 2] = 55.0
+    temp_c[:10, 2] = 54.0
+    found = _impossible_changes(time_s, temp_c)
+    assert any("55 °C beside 35.15 °C within 1 s" in each.what for each in found)
 
 
 UNHELD: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {

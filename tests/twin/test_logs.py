@@ -2,6 +2,7 @@
 
 import gzip
 import logging
+import os
 import zlib
 from collections.abc import Callable, Iterable
 from itertools import combinations, pairwise
@@ -282,8 +283,9 @@ def test_a_table_that_is_no_telemetry_says_why(tmp_path: Path):
 def test_a_folder_is_read_whole_or_says_what_is_left_out(tmp_path: Path, gen3, caplog):
     with pytest.raises(LogError, match=r"holds no log; a log ends in .csv.gz, .csv, .parquet"):
         read_folder(tmp_path)
-    gen3(name="b.csv")
+    gen3({(2, "Temp_0"): "22"}, name="b.csv", count=3)
     gen3(name="a.csv")
+    gen3({(2, "Temp_0"): "hot"}, name=".a.csv")
     (tmp_path / "notes.txt").write_text("kept apart")
     assert [r.name for r in read_folder(tmp_path)] == ["a", "b"]
     (tmp_path / "c.csv").write_text("no log\n")
@@ -300,6 +302,21 @@ def test_a_folder_is_read_whole_or_says_what_is_left_out(tmp_path: Path, gen3, c
         read_folder(tmp_path / "none")
     with pytest.raises(LogError, match="is not a folder"):
         read_folder(tmp_path / "a.csv")
+
+
+def test_a_log_counts_once_and_a_pipe_is_no_log(tmp_path: Path, gen3, caplog):
+    gen3(name="a.csv")
+    copy = tmp_path / "copy of a.csv.gz"
+    copy.write_bytes(gzip.compress((tmp_path / "a.csv").read_bytes()))
+    with pytest.raises(LogError, match=r"copy of a\.csv\.gz: has the readings of 'a\.csv', which would count twice"):
+        read_folder(tmp_path)
+    assert [r.name for r in read_folder(tmp_path, damaged="skip")] == ["a"]
+    copy.unlink()
+    os.mkfifo(tmp_path / "pipe.csv")
+    with pytest.raises(LogError, match=r"pipe\.csv: is a pipe or a device"):
+        read_folder(tmp_path)
+    (tmp_path / "sheet").write_bytes(b"PK\x03\x04...")
+    refused(tmp_path / "sheet", "is a ZIP archive or an XLSX workbook", None)
 
 
 def test_a_folder_without_one_good_log_is_an_error(tmp_path: Path):
