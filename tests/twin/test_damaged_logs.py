@@ -446,12 +446,11 @@ def test_a_clock_put_forward_an_hour_is_told(step_s: float, colder_k: float, tmp
 
 def test_a_jump_is_told_beside_the_reading_that_it_contradicts() -> None:
     """A group of readings before the longest one contradicts the readings behind it, not those before it."""
-    time_s, temp_c = np.arange(0.0, 60.0), np.full((60, 7), 35.0) + 0.01 * np.arange(60.0)[:, None]
+    time_s, temp_c = np.arange(0.0, 60.0), np.full((60, 7), 30.0)
     time_s[10:] += 456.0
-    temp_c[10:15, 2] = 55.0
-    temp_c[:10, 2] = 54.0
-    found = _impossible_changes(time_s, temp_c)
-    assert any("55 °C beside 35.15 °C within 1 s" in each.what for each in found)
+    temp_c[:10, 2], temp_c[10:15, 2] = 35.0, 40.0
+    (found,) = _impossible_changes(time_s, temp_c)
+    assert found.what.startswith("temperature of joint 3 jumps: 40 °C beside 30 °C within 1 s")
 
 
 UNHELD: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
