@@ -376,20 +376,13 @@ def _impossible_changes(time_s: Array, temp_c: Array) -> Iterator[BadReading]:
     possible = possible_temperatures(time_s, temp_c)
     for j in np.flatnonzero(~possible.all(axis=0)):
         for a, b in runs(~possible[:, j]):
-            edges = [(a, a - 1)] * (a > 0) + [(b - 1, b)] * (b < len(time_s)) or [(a, a)]
-            row, beside = max(edges, key=lambda edge: _excess(time_s, temp_c, j, *edge))
+            row, beside = (a, a - 1) if a else (b - 1, min(b, len(time_s) - 1))
             dt_s = abs(time_s[row] - time_s[beside])
             what = (
                 f"temperature of joint {j + 1} jumps: {temp_c[row, j]:.5g} °C beside {temp_c[beside, j]:.5g} °C within "
                 f"{dt_s:.3g} s, where a motor changes by at most {most_temp_change_k(dt_s)[j]:.2g} K"
             )
             yield BadReading(what, "Did its sensor fail?", np.arange(a, b))
-
-
-def _excess(time_s: Array, temp_c: Array, joint: np.intp, row: int, other: int) -> float:
-    """Change of a motor temperature between two rows beyond the largest possible one, K."""
-    allowed_k = most_temp_change_k(abs(time_s[row] - time_s[other]))[joint]
-    return float(abs(temp_c[row, joint] - temp_c[other, joint]) - allowed_k)
 
 
 def _steps(q: Array) -> Array:
