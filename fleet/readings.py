@@ -5,7 +5,7 @@ in `fleet/data/gen3_thermal.json`. Limits of the statistics leave room around 34
 """
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import resources
@@ -61,6 +61,15 @@ MISFIT = 0.05
 """Share of the squared torque that gravity leaves unexplained in a wrong log; of the public logs only one has more."""
 BETTER = 3.0
 """Factor by which another reading of the log must reduce that share before it is named; at most 1.1 in that log."""
+BACK = 0.05
+"""Share of lines across which an angle jumps back, from which a log has two arms; the public logs have none."""
+SLOW_RAD_S = 0.2
+"""Speed up to which gravity causes most of the torque."""
+UNHELD, UNHELD_NM = 0.35, 0.8
+"""Share of the squared torque, and RMS torque, that no mount and payload of a Gen3 leave unexplained. The public logs
+have a share of at most 0.11; with a tenth of their torque it is at least 0.5."""
+MOST_PAYLOAD_KG = 5.0
+"""Largest payload with which torques are explained."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +200,7 @@ def judge(time_s: Array, readings: Mapping[str, Array], *, degrees: bool, measur
     if not measured:
         return bad
     unit = _wrong_unit(readings["temp_c"]) if "temp_c" in readings else ()
-    bad = [*judge_time(time_s), *unit, *bad]
+    bad = [*judge_time(time_s), *unit, *bad, *_interleaved(time_s, readings)]
     if any(found.whole for found in bad):
         return bad
     bad += _stuck(time_s, readings)
@@ -210,7 +219,7 @@ def judge(time_s: Array, readings: Mapping[str, Array], *, degrees: bool, measur
         *_motion(time_s[good], sound, degrees),
         *_currents(sound),
         *_upright(sound, degrees),
-        *_gravity(sound),
+        *(list(_gravity(sound)) or unheld(sound)),
     ]
 
 
@@ -367,10 +376,10 @@ def _impossible_changes(time_s: Array, temp_c: Array) -> Iterator[BadReading]:
     possible = possible_temperatures(time_s, temp_c)
     for j in np.flatnonzero(~possible.all(axis=0)):
         for a, b in runs(~possible[:, j]):
-            beside = a - 1 if a else min(b, len(time_s) - 1)
-            dt_s = abs(time_s[a] - time_s[beside])
+            row, beside = (a, a - 1) if a else (b - 1, min(b, len(time_s) - 1))
+            dt_s = abs(time_s[row] - time_s[beside])
             what = (
-                f"temperature of joint {j + 1} jumps: {temp_c[a, j]:.5g} °C beside {temp_c[beside, j]:.5g} °C within "
+                f"temperature of joint {j + 1} jumps: {temp_c[row, j]:.5g} °C beside {temp_c[beside, j]:.5g} °C within "
                 f"{dt_s:.3g} s, where a motor changes by at most {most_temp_change_k(dt_s)[j]:.2g} K"
             )
             yield BadReading(what, "Did its sensor fail?", np.arange(a, b))
@@ -379,6 +388,31 @@ def _impossible_changes(time_s: Array, temp_c: Array) -> Iterator[BadReading]:
 def _steps(q: Array) -> Array:
     """Change of the angles by at most half a turn, rad, [row − 1, joint]."""
     return (np.diff(q, axis=0) + np.pi) % (2 * np.pi) - np.pi
+
+
+def _interleaved(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]:
+    """Angles that jump there and back, unlike the velocities, as in a file with the lines of two arms."""
+    dt_s, moved, qd = np.diff(time_s), _steps(readings["q"]), readings["qd"]
+    if len(time_s) < LEAST_ROWS or np.median(dt_s) > MOST_MOTION_STEP_S:
+        return
+    apart = np.abs(moved - (qd[1:] + qd[:-1]) / 2.0 * dt_s[:, None])
+    jumps = (apart > LEAST_MOTION_RAD) & (np.abs(moved) > LEAST_MOTION_RAD)
+    back = [np.count_nonzero(np.diff(np.sign(moved[jumps[:, j], j]))) for j in range(JOINTS)]
+    if max(back) > BACK * len(time_s):
+        what = f"the angle of joint {np.argmax(back) + 1} jumps back and forth {max(back)} times, unlike its velocity"
+        yield BadReading(what, "Are two arms in one log? Write a file for each arm.")
+
+
+def clock_step(time_s: Array, temp_c: Array) -> int | None:
+    """Row after a step of an hour across which no motor temperature changes, as if a clock was put forward.
+
+    Args:
+        time_s: Increasing, [row].
+        temp_c: [row, joint].
+    """
+    dt_s, change_k = np.diff(time_s), np.abs(np.diff(temp_c, axis=0)).max(axis=1)
+    steps = np.flatnonzero((np.abs(dt_s - 3600.0) < MOST_STEP_S) & (change_k < TEMP_STEP_K))
+    return int(steps[0]) + 1 if len(steps) else None
 
 
 def _motion(time_s: Array, readings: Mapping[str, Array], degrees: bool) -> Iterator[BadReading]:
@@ -517,18 +551,74 @@ def gravity_terms(q: Array) -> Array:
 
 def _gravity(readings: Mapping[str, Array]) -> Iterator[BadReading]:
     """Torques that no mount and payload explain, but another order, unit or sign of the joints does."""
-    slow = np.flatnonzero(np.abs(readings["qd"]).max(axis=1) < 0.2)
-    if len(slow) < 10:
-        return
-    rows = slow[np.linspace(0, len(slow) - 1, 60).astype(int)]
-    q, tau = readings["q"][rows], readings["tau"][rows]
-    if np.sqrt((tau**2).mean(axis=0)).max() < LEAST_TORQUE_NM or (misfit := _misfit(q, tau)) < MISFIT:
+    q, tau = _slow(readings)
+    if len(q) < 10 or np.sqrt((tau**2).mean(axis=0)).max() < LEAST_TORQUE_NM or (misfit := _misfit(q, tau)) < MISFIT:
         return
     alternatives = [(_misfit(q_, tau_), meant) for q_, tau_, meant in _alternatives(q, tau)]
     least, meant = min(alternatives, key=lambda each: each[0])
     if least * BETTER < misfit:
         what = f"the torques do not fit the angles: gravity leaves {misfit:.0%} of the squared torque unexplained"
         yield BadReading(what, f"With {meant} it would be {least:.0%}. Check the columns, signs and units.")
+
+
+def _slow(readings: Mapping[str, Array]) -> tuple[Array, Array]:
+    """Angles and torques of at most 60 rows with little motion, [row, joint]."""
+    slow = np.flatnonzero(np.abs(readings["qd"]).max(axis=1) < SLOW_RAD_S)
+    rows = slow if len(slow) < 10 else slow[np.linspace(0, len(slow) - 1, 60).astype(int)]
+    return readings["q"][rows], readings["tau"][rows]
+
+
+def unheld(readings: Mapping[str, Array]) -> list[BadReading]:
+    """Torques that no Gen3 has at rest in these postures, in any mount and with any payload.
+
+    Args:
+        readings: `q` rad, `qd` rad/s, `tau` N·m, [row, joint].
+    """
+    q, tau = _slow(readings)
+    if not len(q) or _unexplained([(q, tau)]) < UNHELD:
+        return []
+    rms_nm = np.sqrt((tau**2).mean())
+    what = f"the torques, {rms_nm:.3g} N·m RMS, do not hold the arm: in every mount, gravity needs others"
+    tenfold_fits = _unexplained([(q, 9.81 * tau)]) < UNHELD
+    guess = "Are these kgf·m, or currents in A? " if tenfold_fits else "Was the torque measured? "
+    return [BadReading(what, f"{guess}Give N·m.")]
+
+
+def mounts_differ(*several: Mapping[str, Array]) -> bool:
+    """Whether no single mount explains the torques of several logs of one arm, with a payload each.
+
+    Args:
+        several: `q` rad, `qd` rad/s, `tau` N·m, [row, joint].
+    """
+    return _unexplained([(q, tau) for q, tau in map(_slow, several) if len(q)]) > UNHELD
+
+
+def _unexplained(parts: Sequence[tuple[Array, Array]]) -> float:
+    """Share of the squared torque that gravity leaves unexplained in the best mount, of the worst part.
+
+    Args:
+        parts: Angles, rad, and torques, N·m, [row, joint], each with a payload of its own.
+    """
+    mounts, kg = _mounts(), np.arange(0.0, MOST_PAYLOAD_KG + 0.1, 0.5)
+    factors = np.concatenate(np.broadcast_arrays(mounts[:, None], mounts[:, None] * kg[:, None]), axis=-1)
+    worst = np.zeros(len(mounts))
+    for q, tau in parts:
+        terms, torque = gravity_terms(q).reshape(-1, 6), tau.ravel()
+        needed = ((factors @ (terms.T @ terms)) * factors).sum(axis=-1)
+        left = np.maximum(needed - 2.0 * factors @ (terms.T @ torque) + torque @ torque, 0.0)  # [mount, payload]
+        share = left / np.maximum(np.maximum(needed, torque @ torque), 1e-9)
+        share[left < len(torque) * UNHELD_NM**2] = 0.0
+        worst = np.maximum(worst, share.min(axis=1))
+    return float(worst.min(initial=np.inf))
+
+
+@cache
+def _mounts(count: int = 600) -> Array:
+    """Evenly distributed directions of gravity (Fibonacci lattice), [mount, 3]."""
+    middle = np.arange(count) + 0.5
+    height, angle = 1.0 - 2.0 * middle / count, middle * np.pi * (3.0 - np.sqrt(5.0))
+    radius = np.sqrt(1.0 - height**2)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height])
 
 
 def _misfit(q: Array, tau: Array) -> float:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from fleet.readings import gravity_terms
 from twin.logs.recording import Recording
 from twin.vae.config import TwinConfig
 
@@ -12,12 +13,12 @@ TINY = TwinConfig(
 
 
 def logged(name: str, *, load: float = 1.0, celsius: float = 31.0, seed: int = 0, seconds: float = 80.0) -> Recording:
-    """Seven joints that swing at 2 Hz, joint 2 at one temperature."""
+    """Seven joints of a standing arm that swing at 2 Hz, joint 2 at one temperature."""
     rng = np.random.default_rng(seed)
     time_s = np.arange(0.0, seconds, 1 / RATE_HZ)
     omega, shift = rng.uniform(0.1, 0.6, 7), rng.uniform(0, 6, 7)
     q = 0.5 * np.sin(np.outer(time_s, omega) + shift)
-    tau = load * 10 * np.cos(q) + rng.normal(0, 0.2, q.shape)
+    tau = load * gravity_terms(q)[:, :, 2] + rng.normal(0, 0.2, q.shape)
     temp_c = np.full(q.shape, 30.0)
     temp_c[:, 1] = celsius
     return Recording(name=name, time_s=time_s, q=q, qd=np.gradient(q, time_s, axis=0), tau=tau, temp_c=temp_c)

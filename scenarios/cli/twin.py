@@ -128,6 +128,7 @@ def forecast_command(
     """
     if out is not None:
         check_file(out, (".html",), overwrite)
+    from fleet.readings import mounts_differ
     from scenarios.prepare.planned_motion import motion_of
     from scenarios.show import forecast_page
     from twin.thermal.forecast import forecast
@@ -137,6 +138,11 @@ def forecast_command(
     path = Path(plan)
     if path.exists():
         motion, repeat = one_of(options.arm_recordings(path, arm, skip_damaged, measured=False), path), repeat or 1
+        if mounts_differ(vars(so_far), vars(motion)):
+            raise FleetError(
+                f"No mount of one arm explains the torques of both '{log}' and '{plan}'. Does one of them have the "
+                "other sign, or is it of another arm? Give the torque with which the motors drive the joints."
+            )
     else:
         with progress_bar() as progress:
             motion, most = motion_of(plan, arm, progress)

@@ -23,6 +23,8 @@ from scenarios.spec.schema import MOST_BREAKS, Scenario
 WEEKDAYS = ("monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday")
 DAY, LONGEST_NIGHT = timedelta(days=1), timedelta(hours=12)
 """The end of a day, and the longest break beyond it: a longer one has its begin and end exchanged."""
+SHORT_S = 60.0
+"""Length below which the times of a break are probably minutes."""
 FAILURES = 3
 """Child of the seed of a shift that samples the failures of its arms."""
 _ROUNDING = 1e-9
@@ -89,6 +91,14 @@ def _break_times(
 ) -> Iterator[dict[str, Any]]:
     """The breaks of one entry, with `begin_s` and `end_s`."""
     entry = {name: value for name, value in given.items() if name not in ("begin", "end", "weekdays")}
+    if double := [name for name in ("begin", "end") if name in given and f"{name}_s" in given]:
+        raise ScenarioError(f"{where}: {double[0]} and {double[0]}_s are the same time; keep one of them.")
+    if given.get("arms") == []:
+        raise ScenarioError(f"{where}.arms is empty: name the arms, or leave it out for a break of all of them.")
+    times = [given.get(name, given.get(f"{name}_s")) for name in ("begin", "end")]
+    numbers = [float(each) for each in times if isinstance(each, int | float)]
+    if len(numbers) == 2 and 0 < (length_s := numbers[1] - numbers[0]) < SHORT_S:
+        raise ScenarioError(f"{where} lasts {length_s:g} s: are its times minutes? Give seconds, h:mm or h:mm:ss.")
     if "begin" not in given and "end" not in given and "weekdays" not in given:
         yield entry  # whose own times are checked with its fields
         return

@@ -37,12 +37,15 @@ MOST_NUMBERS, MOST_FAULTS = 5, 100
 MOST_COLUMNS = 100
 """Of a sheet."""
 DAY_S = 86_400.0
+GRAMS, LIGHT_KG = 0.001, 0.02
+"""A gram in kg, and the mass below which all payloads in grams are probably in kg."""
 YEARS = (1970, 2200)
 DATE = "a date with time and zone, as 2026-11-23T06:00+01:00"
 _CLOCK = re.compile(r"(\d{1,4}):([0-5]\d)(?::([0-5]\d(?:[.,]\d+)?))?")
-_ARROW, _OR = re.compile(r"->|→|>|,|;"), re.compile(r"[|;,]")
+_ARROW, _OR = re.compile(r"->|→|>"), re.compile(r"[|;,]")
 _DOTTED_CLOCK = re.compile(r"([01]?\d|2[0-3])[.,]([0-5]\d)")
 """A time of day as it is written in German; seconds have one decimal or none, as a decision takes them."""
+_MILITARY_CLOCK = re.compile(r"(0\d)([0-5]\d)")
 _THOUSANDS = re.compile(r"[1-9]\d{0,2}(\.\d{3})+")
 _GERMAN_DATE = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4}) +(\d{1,2}:\d{2}.*)")
 _FLAGS = {
@@ -67,6 +70,10 @@ class _Dialect(NamedTuple):
     """Whether a comma in a number is the decimal point."""
     horizon_s: float
     """Length of the shift; inf for unknown."""
+    day_fractions: bool
+    """Whether a number below 1 may be a time of day, as in a sheet."""
+    factor: float = 1.0
+    """Of a plain number, to s or kg."""
 
 
 def _number(cell: Cell, dialect: _Dialect) -> float:
@@ -77,7 +84,7 @@ def _number(cell: Cell, dialect: _Dialect) -> float:
         cell = cell.replace(",", ".") if "." not in cell else cell
     with suppress(TypeError, ValueError, OverflowError):
         if not isinstance(cell, bool) and isfinite(number := float(cell)):
-            return number
+            return dialect.factor * number
     raise ValueError(f"expected a number (got {_shown(cell)})")
 
 
@@ -91,6 +98,11 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
     """Time from the begin of the shift, s."""
     if isinstance(cell, timedelta):
         return cell.total_seconds()
+    if dialect.day_fractions and isinstance(cell, float) and 0.0 < cell < 1.0:
+        clock_time = f"{datetime.min + timedelta(days=cell):%H:%M}"
+        raise ValueError(
+            f"is this {clock_time}? Give its cell a format of time, or a number as a text (got {_shown(cell)})"
+        )
     text, begin = _text(cell.isoformat() if isinstance(cell, time | datetime) else cell), dialect.begin
     if clock := _CLOCK.fullmatch(text):
         hours, minutes, seconds = (float((part or "0").replace(",", ".")) for part in clock.groups())
@@ -108,8 +120,10 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
             )
         return since_s if since_s >= 0 else since(begin, tomorrow)
     if isinstance(cell, str) and (dotted := _DOTTED_CLOCK.fullmatch(text)):
-        seconds = f"{float(text.replace(',', '.')):.3f}"
-        raise ValueError(f"is this {dotted[1]}:{dotted[2]}? Give times as h:mm, or seconds as {seconds}")
+        number = f"{float(text.replace(',', '.')):.3f}"
+        raise ValueError(f"is this {dotted[1]}:{dotted[2]}? Give times as h:mm, or a number as {number}")
+    if isinstance(cell, str) and (clock := _MILITARY_CLOCK.fullmatch(text)):
+        raise ValueError(f"is this {clock[1]}:{clock[2]}? Give times as h:mm, or a number as {int(text)}")
     with suppress(ValueError):
         return _number(cell, dialect)
     if german := _GERMAN_DATE.fullmatch(text):
@@ -124,6 +138,15 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
     if not YEARS[0] <= date.year <= YEARS[1]:
         raise ValueError(f"expected a year from {YEARS[0]} to {YEARS[1]} (got {date.year})")
     return since(begin, date if date.tzinfo else date.replace(tzinfo=begin.tzinfo))
+
+
+def _job_time(cell: Cell, dialect: _Dialect) -> float:
+    """As `_seconds`; with the begin of the shift as a date, not before it."""
+    if (time_s := _seconds(cell, dialect)) < 0 and (begin := dialect.begin):
+        date = (begin.astimezone(UTC) + timedelta(seconds=time_s)).astimezone(begin.tzinfo)
+        form = "%d %b %Y %H:%M"
+        raise ValueError(f"{date:{form}} is before the shift, which begins on {begin:{form}} (got {_shown(cell)})")
+    return time_s
 
 
 def since(begin: datetime, date: datetime) -> float:
@@ -141,7 +164,7 @@ def seconds_of(given: object, begin: datetime | None, horizon_s: float) -> float
     Raises:
         ValueError: it is no time.
     """
-    return _seconds(given, _Dialect(begin, False, horizon_s))
+    return _seconds(given, _Dialect(begin, False, horizon_s, False))
 
 
 def _names(cell: Cell, _: object) -> tuple[str, ...]:
@@ -160,6 +183,10 @@ def _places(cell: Cell, _: object) -> tuple[tuple[str, ...], ...]:
     if isinstance(cell, list):
         lists = cell if all(isinstance(each, list) for each in cell) else [cell]
         return tuple(tuple(map(_text, each)) for each in lists)
+    if re.search("[,;]", _text(cell)):
+        raise ValueError(
+            f"give > between from and to, and | between alternatives, no comma or semicolon (got {_shown(cell)})"
+        )
     return tuple(tuple(name.strip() for name in _ARROW.split(each)) for each in _text(cell).split("|"))
 
 
@@ -187,8 +214,8 @@ _COLUMNS: Mapping[str, tuple[str, Callable[[Cell, _Dialect], object], object]] =
     "places": ("every_places", _places, ()),
     "payload": ("payload_kg", _number, 0.0),
     "repetitions": ("repetitions", _count, 1),
-    "release": ("release_s", _seconds, 0.0),
-    "due": ("due_s", _seconds, None),
+    "release": ("release_s", _job_time, 0.0),
+    "due": ("due_s", _job_time, None),
     "hard": ("expires", _flag, False),
     "value": ("value", _number, 1.0),
     "after": ("after", _names, ()),
@@ -200,7 +227,7 @@ _NEEDED = ("name", "kind", "places")
 _COLUMN_OF = {field: column for column, (field, _, _) in _COLUMNS.items()}
 _SPELLINGS = {
     **{column: (column, 1.0) for column in _COLUMNS},
-    **{"expires": ("hard", 1.0), "payload_kg": ("payload", 1.0), "payload_g": ("payload", 0.001)},
+    **{"expires": ("hard", 1.0), "payload_kg": ("payload", 1.0), "payload_g": ("payload", GRAMS)},
     **{"force_n": ("force", 1.0), "dwell_s": ("dwell", 1.0)},
     **{f"{each}_{unit}": (each, s) for each in ("release", "due") for unit, s in (("s", 1.0), ("min", 60.0))},
 }
@@ -252,10 +279,11 @@ def read_job_table(
     """
     where, faults, jobs = where or str(file), _Faults(), dict[int, JobSpec]()
     lines, decimal_comma = _rows(file, where)
-    number, head = next(lines, (1, ()))
+    is_sheet = isinstance(file, Path) and file.suffix.lower() == ".xlsx"
+    head_row, head = next(lines, (1, ()))
     if len(head) > MOST_COLUMNS:
         raise ScenarioError(f"{where} has {len(head)} columns; a job table has at most {MOST_COLUMNS}.")
-    columns, dialect = _read_head(number, head, faults), _Dialect(begin, decimal_comma, horizon_s)
+    columns, dialect = _read_head(head_row, head, faults), _Dialect(begin, decimal_comma, horizon_s, is_sheet)
     faults.raise_any(where)
     no_place = cache(lambda name: f"no place '{printable(name)}'{nearest(name, places or ())}")
     rows: dict[str, tuple[int, Row]] = {}
@@ -278,6 +306,11 @@ def read_job_table(
             fields = {**vars(row), "places": row.every_places[0], "alternatives": row.every_places[1:]}
             jobs[number] = JobSpec(**{name: value for name, value in fields.items() if name != "every_places"})
         rows.setdefault(row.name, (number, row))
+    heaviest_kg = max((row.payload_kg for _, row in rows.values()), default=0.0)
+    if ("payload", GRAMS) in columns.values() and 0.0 < heaviest_kg < LIGHT_KG:
+        faults.add(
+            head_row, "payload_g", f"are these kg? The heaviest is {heaviest_kg / GRAMS:g}. Give kg in a column payload"
+        )
     _check_after(rows, faults, closed=closed)
     faults.raise_any(where)
     if not jobs:
@@ -317,8 +350,7 @@ def _read_row(
         field, convert, _ = _COLUMNS[column]
         try:
             if not _is_empty(cell):
-                value = convert(cell, dialect)
-                setattr(row, field, factor * value if factor != 1.0 and isinstance(value, float) else value)
+                setattr(row, field, convert(cell, dialect._replace(factor=factor)))
             elif column in _NEEDED:
                 raise ValueError("is empty; every job needs one")
         except ValueError as error:
@@ -500,7 +532,10 @@ def _xlsx_rows(content: bytes, where: str) -> Rows:
 
 
 def _as_shown(cell: Any) -> Cell:
-    """The value of a cell of a sheet; a whole number with leading zeros, such as the name 0012, as a text."""
+    """The value of a cell of a sheet; a whole number with leading zeros, such as 0012, and a duration as texts."""
+    if isinstance(cell.value, timedelta):
+        hours, rest = divmod(cell.value, timedelta(hours=1))
+        return f"{hours}:{str(rest)[2:]}"
     zeros = re.fullmatch("00+", str(cell.number_format)) and isinstance(cell.value, int)
     return f"{cell.value:0{len(cell.number_format)}d}" if zeros else cell.value
 
@@ -542,5 +577,10 @@ def shift_begin(given: object, where: str, zone: tzinfo | None = None) -> dateti
     if begin in (None, ""):
         return None
     if isinstance(begin, datetime) and (begin.tzinfo or zone) and YEARS[0] <= begin.year <= YEARS[1]:
-        return begin.replace(tzinfo=begin.tzinfo or zone).astimezone(zone or begin.tzinfo)
+        begin = begin.replace(tzinfo=begin.tzinfo or zone)
+        if begin.astimezone(UTC).astimezone(begin.tzinfo).replace(tzinfo=None) != begin.replace(tzinfo=None):
+            raise ScenarioError(
+                f"{where} = {given} does not exist: summer time leaves out this hour. Give another time."
+            )
+        return begin.astimezone(zone or begin.tzinfo)
     raise ScenarioError(f"{where} must be {DATE} (got {given}).")

@@ -354,10 +354,13 @@ class Scenario:
                 f"(got {latest_s:.15g})"
             )
         check_names(self, "name")
-        for each in (*self.arms, *self.places, *self.fixtures):
-            check_names(each, "name")
+        for kind in ("arms", "places", "fixtures", "jobs"):
+            for i, each in enumerate(getattr(self, kind)):
+                try:
+                    check_names(each, "name", of_jobs=kind == "jobs")
+                except ValueError as error:
+                    raise ValueError(f"Scenario.{kind}[{i}].{str(error).partition('.')[2]}") from error
         for stream in self.jobs:
-            check_names(stream, "name", of_jobs=True)
             if stream.numbered and len(stream.name) > MAX_NAME - _NUMBER:
                 raise ValueError(
                     f"JobStream.name must have at most {MAX_NAME - _NUMBER} characters, as its jobs have a number "

@@ -153,6 +153,15 @@ BREAK = {"name": "lunch", "begin": "4:00", "end": "5:00"}
             {"breaks": [BREAK | {"begin": "0:00", "end": "0:00"}], "shift_begin": "2026-11-23T06:00Z"},
             r"breaks\[0\]: it ends at 0:00, before it begins at 0:00",
         ),
+        ({"breaks": [BREAK | {"begin_s": 14400}]}, r"breaks\[0\]: begin and begin_s are the same time; keep one"),
+        ({"breaks": [BREAK | {"arms": []}]}, r"breaks\[0\].arms is empty: name the arms, or leave it out"),
+        ({"breaks": [BREAK | {"begin": 480, "end": 510}]}, r"breaks\[0\] lasts 30 s: are its times minutes"),
+        ({"breaks": [{"name": "a", "begin_s": 480, "end_s": 510.0}]}, r"breaks\[0\] lasts 30 s: are its times minutes"),
+        (
+            {"shift_begin": "2026-03-29T02:30", "time_zone": "Europe/Berlin"},
+            "shift_begin = 2026-03-29T02:30 does not exist: summer time leaves out this hour",
+        ),
+        ({"places": [{**small()["places"][0], "name": "a\nb"}]}, r"heat.toml: places\[0\].name must have 1 to 128"),
         ({"time_zone": "Europe/Berln"}, "there is no time zone 'Europe/Berln'; give a name as Europe/Berlin"),
         (
             {"breaks": [BREAK | {"begin": "2026-11-23T10:00", "end": "2026-11-23T09:00"}],
@@ -194,8 +203,8 @@ def test_weekly_arrivals_that_cannot_be_are_named() -> None:
 
 def test_breaks_begin_and_end_with_decisions() -> None:
     scenario = with_breaks(
-        {"name": "one", "begin_s": 95, "end_s": 130},
-        {"name": "two", "begin_s": 200.0, "end_s": 201.0, "arms": [small()["arms"][1]["name"]], "finish": "job"},
+        {"name": "one", "begin": "0:01:35", "end": "0:02:10"},
+        {"name": "two", "begin": "0:03:20", "end": "0:03:21", "arms": [small()["arms"][1]["name"]], "finish": "job"},
         {"name": "three", "begin_s": -50, "end_s": 20, "arms": [small()["arms"][0]["name"]]},
     )
     assert scenario.decision_interval_s == 10.0

@@ -227,6 +227,8 @@ FAULTS = {
     "x,hold,bench,,,-1,,,,": "column release: must be between 0 and 1000000000 s (got -1.0).",
     "x,hold,bench,,,soon,,,,": "column release: expected seconds, h:mm, h:mm:ss, or a date with time and zone, as 2026",
     "x,hold,bench,,,6:75,,,,": "column release: expected seconds, h:mm, h:mm:ss, or a date with time and",
+    "x,hold,bench,,,0600,,,,": "column release: is this 06:00? Give times as h:mm, or a number as 600.",
+    "x,hold,bench;shelf,,,,,,,": "column places: give > between from and to, and | between alternatives, no comma or",
     "x,hold,bench,,,2026-11-23,,,,": "column release: a date needs shift_begin, the begin of the shift, or --shift-",
     "x,hold,bench,,,60,30,,,": "column due: must not be before the release at 60 s (got 30 s).",
     "x,hold,bench,,,,,yes,,": "column due: a hard due date needs a time.",
@@ -264,9 +266,50 @@ def test_what_a_german_spreadsheet_writes_is_read_or_asked_about(tmp_path):
     assert not second.expires
     for row, sentence in (
         ("a;hold;bench;;1.000;;;;;", "column repetitions: is this 1000? Give numbers without separators of thousands"),
+        (
+            "a;hold;bench;;;22.11.2026 6:00;;;;",
+            "column release: 22 Nov 2026 06:00 is before the shift, which begins on 23 ",
+        ),
         ("a;hold;bench;;;6:01;5:00;;;", "column due: '5:00' is outside the shift, which begins at 06:00 and"),
     ):
         assert sentence in faults_of(tmp_path, f"{SHORT.replace(',', ';')}\n{row}\n", begin)
+
+
+def test_only_plain_numbers_are_scaled_to_the_unit_of_a_heading(tmp_path):
+    text = "name,kind,places,release_min,due_min\na,hold,bench,1,6:02\nb,hold,bench,0,2026-11-23T06:02:30+01:00\n"
+    jobs = drawn(small_table(tmp_path, text, "shift_begin = 2026-11-23T06:00:00+01:00"), 0)
+    assert {job.name: (job.release_s, job.due_s) for job in jobs} == {"a": (60.0, 120.0), "b": (0.0, 150.0)}
+
+
+def test_light_payloads_in_grams_are_asked_about(tmp_path):
+    for grams, refused in (("0.5", True), ("200", False)):
+        path = tmp_path / "jobs.csv"
+        path.write_text(f"name,kind,places,payload_g\na,hold,bench,{grams}\nb,hold,bench,2\n", encoding="utf-8")
+        if refused:
+            with pytest.raises(
+                ScenarioError, match=r"row 1, column payload_g: are these kg\? The heaviest is 2. Give kg"
+            ):
+                read_job_table(path)
+        else:
+            assert [job.payload_kg for job in read_job_table(path).values()] == [0.2, 0.002]
+
+
+def test_times_of_a_sheet_are_those_that_it_shows(tmp_path):
+    openpyxl = pytest.importorskip("openpyxl")
+    begin, path = datetime(2026, 11, 23, 6, tzinfo=UTC), tmp_path / "jobs.xlsx"
+    for format_, day_fraction, release_s in (("[h]:mm", 0.25, 0.0), ("[h]:mm", 0.5, 21600.0), ("General", 0.25, None)):
+        book = openpyxl.Workbook()
+        book.active.append(["name", "kind", "places", "release"])
+        book.active.append(["a", "hold", "bench", day_fraction])
+        book.active["D2"].number_format = format_
+        book.save(path)
+        if release_s is None:
+            with pytest.raises(
+                ScenarioError, match=r"is this 06:00\? Give its cell a format of time, or a number as a text"
+            ):
+                read_job_table(path, begin=begin)
+        else:
+            assert [job.release_s for job in read_job_table(path, begin=begin).values()] == [release_s]
 
 
 def test_a_quote_that_is_never_closed_is_told_and_no_row_is_lost(tmp_path):

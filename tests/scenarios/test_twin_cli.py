@@ -74,7 +74,8 @@ def test_a_log_becomes_a_twin_that_finds_threefold_torque_harder(thermofleet, tw
         assert {row["data"] for row in rows} == {card["twins"][0]["data_hash"]}
         mean_d[name] = np.mean([float(row["d_2"]) for row in rows])
         for row in rows:
-            assert float(row["d"]) == pytest.approx(sum(float(row[f"d_{j}"]) for j in range(1, 8)), rel=1e-4)
+            each = [float(row[f"d_{j}"]) for j in range(1, 8)]
+            assert 7 * min(each) <= float(row["d"]) <= 7 * max(each)  # a sum with weights of mean 1
         mean_load[name] = np.mean([float(row["load"]) for row in rows])
     assert mean_d["hot.csv"] > mean_d["cool/monday.csv"]
     assert mean_load["hot.csv"] > 2 * mean_load["cool/monday.csv"]

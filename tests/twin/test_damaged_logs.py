@@ -15,7 +15,15 @@ from hypothesis import strategies as st
 
 from fleet.arm.model import ArmModel
 from fleet.errors import LogError
-from fleet.readings import BadReading, gravity_terms, judge, most_temp_change_k, possible_temperatures
+from fleet.readings import (
+    BadReading,
+    _impossible_changes,
+    gravity_terms,
+    judge,
+    most_temp_change_k,
+    mounts_differ,
+    possible_temperatures,
+)
 from fleet.robot import Robot
 from twin.logs.reader import read
 from twin.logs.recording import READINGS, stretches
@@ -403,12 +411,80 @@ def test_coarse_recorders_and_slow_ones_are_not_refused(channel: str, digits: in
     """Most readings of such a channel repeat: no sensor is dead for that."""
     time_s = np.arange(0.0, 900.0, 0.5)
     q = 0.4 * np.sin(np.outer(time_s, 0.1 * np.arange(1, 8)) + np.arange(7))
-    readings = {"q": q, "qd": np.gradient(q, time_s, axis=0), "tau": 2.0 * np.cos(q), "temp_c": 31.0 + 0.2 * np.sin(q)}
+    tau = gravity_terms(q)[:, :, 2] + 0.1 * np.cos(q)
+    readings = {"q": q, "qd": np.gradient(q, time_s, axis=0), "tau": tau, "temp_c": 31.0 + 0.2 * np.sin(q)}
     readings["current_a"] = 0.1 * readings["tau"]
     readings[channel] = readings[channel].round(digits)
     assert judge(time_s, readings, degrees=False) == []
     slow = {name: values[::4] for name, values in readings.items()}
     assert judge(time_s[::4], slow, degrees=False) == []
+
+
+@pytest.mark.parametrize("rows", [1, 5])
+@pytest.mark.parametrize("damaged", ["refuse", "skip"])
+def test_the_lines_of_two_arms_in_one_file_are_named(rows: int, damaged: str, tmp_path: Path) -> None:
+    """Alternately, and in blocks: nothing of them is read."""
+    one, other = sound(), sound(start=-START, seed=1)
+    second = np.arange(ROWS) // rows % 2 == 1
+    for group, values in one.groups.items():
+        values[second] = other.groups[group][second]
+    (tmp_path / "log.csv").write_text(one.text(), encoding="utf-8")
+    with pytest.raises(LogError, match=r"jumps back and forth .* Are two arms in one log"):
+        read(tmp_path / "log.csv", damaged=damaged)
+
+
+@pytest.mark.parametrize(("step_s", "colder_k"), [(3600.0, 0.0), (3600.0, 5.0), (1800.0, 0.0)])
+def test_a_clock_put_forward_an_hour_is_told(step_s: float, colder_k: float, tmp_path: Path, caplog) -> None:
+    log = sound()
+    log.time_s[150:] += step_s
+    log.groups["Temp"][150:] -= colder_k
+    (tmp_path / "log.csv").write_text(log.text(), encoding="utf-8")
+    with caplog.at_level(logging.WARNING):
+        read(tmp_path / "log.csv")
+    assert ("line 152: time steps by 3600 s" in caplog.text) == (step_s == 3600.0 and not colder_k)
+
+
+def test_a_jump_is_told_beside_the_reading_that_it_contradicts() -> None:
+    """Of the first readings that is the last one, not the first, which is within reach."""
+    time_s, temp_c = np.arange(0.0, 60.0), np.full((60, 7), 30.0)
+    temp_c[:15, 2] = np.linspace(31.0, 40.0, 15)
+    (found,) = _impossible_changes(time_s, temp_c)
+    assert found.what.startswith("temperature of joint 3 jumps: 40 °C beside 30 °C within 1 s")
+
+
+UNHELD: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
+    "zero": (lambda tau: 0.0 * tau, "Was the torque measured?"),
+    "kgf·m": (lambda tau: tau / 9.81, "Are these kgf·m"),
+    "amperes": (lambda tau: tau / TORQUE_PER_AMP, "currents in A"),
+    "noise": (lambda tau: np.random.default_rng(0).normal(0.0, 3.0, tau.shape), "Was the torque measured?"),
+}
+
+
+@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize("name", UNHELD)
+def test_a_torque_that_does_not_hold_the_arm_is_refused(name: str, measured: bool, tmp_path: Path) -> None:
+    """Of a log and of a plan: with it, a forecast would be far too cool."""
+    log, (change, question) = sound(kg=0.0), UNHELD[name]
+    path = tmp_path / "log.csv"
+    path.write_text(log.text(), encoding="utf-8")
+    assert read(path, measured=measured)
+    log.groups["Torque"] = change(log.groups["Torque"])
+    log = log.plain()
+    log.groups.pop("Current")
+    path.write_text(log.text([each for each in PLAIN_NAMES if "current" not in each]), encoding="utf-8")
+    with pytest.raises(LogError, match="do not hold the arm") as refused:
+        read(path, measured=measured)
+    assert question in str(refused.value)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_log_and_a_plan_of_one_arm_have_one_mount(sign: float) -> None:
+    """With the other sign the arm would hang from the ceiling."""
+    parts = []
+    for start, factor in ((START, 1.0), (START[::-1], sign)):
+        q = start + 0.3 * np.sin(np.linspace(0.0, 5.0, 50))[:, None]
+        parts.append({"q": q, "qd": 0.0 * q, "tau": factor * gravity_terms(q)[:, :, 2]})
+    assert mounts_differ(*parts) == (sign < 0)
 
 
 def test_a_planned_motion_has_no_sensors(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import gzip
 import logging
+import os
 import zlib
 from collections.abc import Callable, Iterable
 from itertools import combinations, pairwise
@@ -33,16 +34,16 @@ TIME_S = (0.0, 0.5, 1.1, 1.5)
 
 
 def gen3_row(time_s: float) -> list[str]:
-    """Joint k (1..7) at k degrees below zero, 20 + k °C, k N·m on the joint with some noise, −k/10 A, k/100 °/s."""
+    """Joint k (1..7) at k degrees below zero, 20 + k °C, k/10 N·m on the joint with some noise, −k/10 A, k/100 °/s."""
     k = np.arange(1, 8)
-    numbers = [time_s, *(360.0 - k), *(20.0 + k), *((1 + 1e-9 * time_s) * k), *(-0.1 * k), *(0.01 * k)]
+    numbers = [time_s, *(360.0 - k), *(20.0 + k), *((0.1 + 1e-9 * time_s) * k), *(-0.1 * k), *(0.01 * k)]
     return [repr(float(n)) for n in numbers]
 
 
 def plain_row(time_s: float) -> list[str]:
     """The same in SI with our signs."""
     k = np.arange(1, 8)
-    numbers = [time_s, *np.deg2rad(-k), *np.deg2rad(0.01 * k), *(-1.0 * k), *(-0.1 * k), *(20.0 + k)]
+    numbers = [time_s, *np.deg2rad(-k), *np.deg2rad(0.01 * k), *(-0.1 * k), *(-0.1 * k), *(20.0 + k)]
     return [repr(float(n)) for n in numbers]
 
 
@@ -82,7 +83,13 @@ def test_all_formats_say_the_same_in_si(tmp_path: Path, gen3: Callable[..., Path
         (recording,) = read(path)
         assert (recording.name, recording.dropped) == (name, ())
         np.testing.assert_allclose(recording.time_s, TIME_S)
-        expected = {"q": np.deg2rad(-k), "qd": np.deg2rad(k / 100), "tau": -k, "current_a": -k / 10, "temp_c": 20 + k}
+        expected = {
+            "q": np.deg2rad(-k),
+            "qd": np.deg2rad(k / 100),
+            "tau": -k / 10,
+            "current_a": -k / 10,
+            "temp_c": 20 + k,
+        }
         for channel, values in expected.items():
             np.testing.assert_allclose(getattr(recording, channel), values, atol=1e-12)
 
@@ -105,7 +112,7 @@ def test_columns_may_come_in_any_order_and_currents_and_temperatures_may_lack(tm
     path = tmp_path / "short.csv"
     path.write_text("\ufeff" + text([f'"{PLAIN[i]}"' for i in order], rows, "\n"), encoding="utf-8")
     (recording,) = read(path)
-    np.testing.assert_allclose(recording.tau[0], -np.arange(1.0, 8.0))
+    np.testing.assert_allclose(recording.tau[0], -np.arange(1.0, 8.0) / 10)
     assert recording.current_a is recording.temp_c is None
 
 
@@ -276,8 +283,9 @@ def test_a_table_that_is_no_telemetry_says_why(tmp_path: Path):
 def test_a_folder_is_read_whole_or_says_what_is_left_out(tmp_path: Path, gen3, caplog):
     with pytest.raises(LogError, match=r"holds no log; a log ends in .csv.gz, .csv, .parquet"):
         read_folder(tmp_path)
-    gen3(name="b.csv")
+    gen3({(2, "Temp_0"): "22"}, name="b.csv", count=3)
     gen3(name="a.csv")
+    gen3({(2, "Temp_0"): "hot"}, name=".a.csv")
     (tmp_path / "notes.txt").write_text("kept apart")
     assert [r.name for r in read_folder(tmp_path)] == ["a", "b"]
     (tmp_path / "c.csv").write_text("no log\n")
@@ -296,6 +304,21 @@ def test_a_folder_is_read_whole_or_says_what_is_left_out(tmp_path: Path, gen3, c
         read_folder(tmp_path / "a.csv")
 
 
+def test_a_log_counts_once_and_a_pipe_is_no_log(tmp_path: Path, gen3, caplog):
+    gen3(name="a.csv")
+    copy = tmp_path / "copy of a.csv.gz"
+    copy.write_bytes(gzip.compress((tmp_path / "a.csv").read_bytes()))
+    with pytest.raises(LogError, match=r"copy of a\.csv\.gz: has the readings of 'a\.csv', which would count twice"):
+        read_folder(tmp_path)
+    assert [r.name for r in read_folder(tmp_path, damaged="skip")] == ["a"]
+    copy.unlink()
+    os.mkfifo(tmp_path / "pipe.csv")
+    with pytest.raises(LogError, match=r"pipe\.csv: is a pipe or a device"):
+        read_folder(tmp_path)
+    (tmp_path / "sheet").write_bytes(b"PK\x03\x04...")
+    refused(tmp_path / "sheet", "is a ZIP archive or an XLSX workbook", None)
+
+
 def test_a_folder_without_one_good_log_is_an_error(tmp_path: Path):
     (tmp_path / "c.csv").write_text("no log\n")
     with pytest.raises(LogError, match="none of its 1 logs is usable"):
@@ -309,14 +332,16 @@ def test_the_recorder_in_the_documentation_writes_a_gen3_log(tmp_path: Path):
     exec(code, space)
     k = iter(range(1, 8))
     actuators = [
-        SimpleNamespace(position=360.0 - i, temperature_motor=20.0 + i, torque=i, current_motor=-0.1 * i, velocity=i)
+        SimpleNamespace(
+            position=360.0 - i, temperature_motor=20.0 + i, torque=0.1 * i, current_motor=-0.1 * i, velocity=i
+        )
         for i in k
     ]
     arm = SimpleNamespace(RefreshFeedback=lambda: SimpleNamespace(actuators=actuators))
     space["record"](arm, tmp_path / "own.csv", duration_s=0.01, rate_hz=1e6)
     (own,) = read(tmp_path / "own.csv")
     np.testing.assert_allclose(own.q[0], np.deg2rad(-np.arange(1.0, 8.0)))
-    np.testing.assert_allclose(own.tau[0], -np.arange(1.0, 8.0))
+    np.testing.assert_allclose(own.tau[0], -np.arange(1.0, 8.0) / 10)
     np.testing.assert_allclose(own.temp_c[-1], 20 + np.arange(1.0, 8.0))
 
 

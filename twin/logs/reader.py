@@ -1,6 +1,7 @@
 """Read logs of real and simulated arms: Gen3 CSV, plain CSV (both plain or gzip), telemetry.parquet."""
 
 import gzip
+import hashlib
 import logging
 import os
 import re
@@ -21,7 +22,7 @@ import pyarrow.parquet as pq
 
 from fleet.errors import LogError, nearest
 from fleet.files import decode_text
-from fleet.readings import judge, repeats
+from fleet.readings import clock_step, judge, repeats, unheld
 from fleet.robot import JOINTS
 from twin.logs.recording import GAP_S, READINGS, Recording
 
@@ -134,7 +135,7 @@ def _kind(reason: str) -> str:
     return "".join(c for c in reason.partition(":")[0] if not c.isdigit())
 
 
-_GZIP = b"\x1f\x8b"
+_GZIP, _ZIP = b"\x1f\x8b", b"PK\x03\x04"
 
 
 def read_csv(path: Path) -> LogTable:
@@ -148,6 +149,8 @@ def read_csv(path: Path) -> LogTable:
     except OSError as error:
         raise LogError(str(path), None, f"cannot be read: {error.strerror or error}.") from error
     broken = None
+    if data.startswith(_ZIP):
+        raise LogError(str(path), None, "is a ZIP archive or an XLSX workbook. Unpack it, or save the sheet as CSV.")
     if data.startswith(_GZIP):
         data, broken = _decompress(data)
     elif data and path.suffix == ".gz":
@@ -458,7 +461,7 @@ def read(path: str | Path, *, damaged: Damaged = "refuse", measured: bool = True
     Args:
         damaged: "refuse" raises on any unusable line; "skip" drops such lines, logs a warning, and lists them in
             `Recording.dropped`.
-        measured: Whether sensors made a CSV log; of a planned motion only ranges are judged.
+        measured: Whether sensors made a CSV log; of a planned motion only ranges and gravity are judged.
 
     Raises:
         LogError: file, line and reason.
@@ -504,17 +507,19 @@ def _repeated_percent(recording: Recording) -> float:
 
 
 def read_folder(path: str | Path, *, damaged: Damaged = "refuse") -> list[Recording]:
-    """The recordings of all logs of a folder, by file name, without its subfolders.
+    """The recordings of all logs of a folder, by file name, without its subfolders and hidden files.
 
-    With damaged="skip" a file without any good line is skipped too, with a warning.
+    With damaged="skip" a file without any good line, or with readings of another one, is skipped with a warning.
 
     Raises:
-        LogError: as `read` for the first unusable file; or no log, no usable log, or two logs of one name.
+        LogError: as `read` for the first unusable file; or no log, no usable log, or two logs of one name or
+            of the same readings.
     """
     path = Path(path)
     if not path.is_dir():
         raise LogError(str(path), None, "is not a folder." if path.exists() else "does not exist.")
-    files = sorted(f for f in path.iterdir() if f.name.lower().endswith(SUFFIXES) and f.name not in NOT_LOGS)
+    named = sorted(f for f in path.iterdir() if f.name.lower().endswith(SUFFIXES) and f.name not in NOT_LOGS)
+    files = [f for f in named if not f.name.startswith(".")]
     if not files:
         raise LogError(str(path), None, f"holds no log; a log ends in {', '.join(SUFFIXES)}.")
     by_name = {_name(f): f for f in files}
@@ -522,9 +527,16 @@ def read_folder(path: str | Path, *, damaged: Damaged = "refuse") -> list[Record
         if by_name[_name(f)] != f:
             raise LogError(str(path), None, f"'{f.name}' and '{by_name[_name(f)].name}' are the same log; keep one.")
     by_file: dict[Path, list[Recording]] = {}
+    by_content: dict[bytes, Path] = {}
     for f in files:
         try:
-            by_file[f] = _read(f, damaged, measured=True)
+            if f.exists() and not (f.is_file() or f.is_dir()):
+                raise LogError(str(f), None, "is a pipe or a device; a log is a file.")
+            found = _read(f, damaged, measured=True)
+            content = b"".join(each.time_s.tobytes() + each.q.tobytes() + each.tau.tobytes() for each in found)
+            if (first := by_content.setdefault(hashlib.sha256(content).digest(), f)) != f:
+                raise LogError(str(f), None, f"has the readings of '{first.name}', which would count twice; keep one.")
+            by_file[f] = found
         except LogError as error:
             if damaged == "refuse":
                 raise
@@ -582,6 +594,8 @@ def _recording(
     good = {channel: values[rows] for channel, values in readings.items()}
     dropped_lines = {d.line for d in damage}
     bad = judge(time_s[rows], good, degrees=layout.turns, measured=is_csv and measured)
+    if is_csv and not measured and not bad:
+        bad = unheld(good)
     if part and damaged == "skip":
         bad = [replace(found, most=False) for found in bad]
     for found in sorted(bad, key=lambda found: not found.whole):
@@ -612,6 +626,12 @@ def _recording(
             warned.add(what)
     kept = {channel: np.ascontiguousarray(values[keep]) for channel, values in readings.items()}
     time_s = time_s[keep]
+    if is_csv and measured and "temp_c" in kept and (row := clock_step(time_s, kept["temp_c"])):
+        log.warning(
+            "%s, line %d: time steps by %.0f s, but no motor temperature changes. Was the clock put forward for "
+            "summer time? Then subtract an hour from the times that follow; else an hour without load is assumed.",
+            *(path, table.where[keep][row], time_s[row] - time_s[row - 1]),
+        )
     if len(time_s) and time_s[0] >= EPOCH_S:
         time_s = time_s - time_s[0]
     return Recording(name=name, time_s=time_s, **kept, dropped=dropped)
