@@ -35,7 +35,7 @@ from scenarios.show.run_page import (
     verdict,
 )
 from scenarios.show.timeline import shift_charts, stream_of
-from scenarios.show.words import offer_text
+from scenarios.show.words import duration, offer_text
 
 ARMS = ("arm_0", "arm_1")
 HOSTILE = '</script><img src="https://evil.example/x"><b>-001'
@@ -309,6 +309,22 @@ def test_a_large_fleet_gets_a_heat_map_and_lanes_of_its_hottest_arms() -> None:
     go.Figure(shown)
 
 
+@pytest.mark.parametrize(
+    ("time_s", "text"),
+    [
+        (0, "0 s"),
+        (59.7, "1 min"),
+        (90, "1 min 30 s"),
+        (150, "2 min 30 s"),
+        (3240, "54 min"),
+        (3599.8, "1 h"),
+        (5430, "1 h 30 min"),
+    ],
+)
+def test_a_duration_below_an_hour_has_its_seconds(time_s: float, text: str) -> None:
+    assert duration(time_s) == text
+
+
 @pytest.mark.parametrize(("job", "stream"), [("sort_parts-001", "sort_parts"), ("a-b-2", "a-b"), ("lonely", "lonely")])
 def test_the_stream_of_a_job_stands_before_its_last_dash(job: str, stream: str) -> None:
     assert stream_of(job) == stream
@@ -348,7 +364,7 @@ def test_each_side_says_what_happened_and_what_became_of_the_job_on_the_other():
         ("bad", "round_robin: 1 fault"),
         ("good", "wsept: No fault, no late job"),
     ]
-    assert "arm_a stopped during crate, out for 13 min: the motor of joint 2 passed 75 °C" in burned
+    assert "arm_a stopped during crate, out for 13 min 20 s: the motor of joint 2 passed 75 °C" in burned
     assert "Under wsept, arm_b finished crate at 0:05:00 without a fault." in burned
     assert 'href="round_robin/report.html"' in page
     assert "Under" not in spared
