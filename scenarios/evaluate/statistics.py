@@ -598,7 +598,7 @@ def remarks(figures: Mapping[str, Mapping[str, Figure]], draws: int) -> Iterator
     if any(
         f.note.startswith("no variation") and np.isfinite(f.low) for each in figures.values() for f in each.values()
     ):
-        yield f"Values all at an end of their range have the exact bound of {draws} in {draws} (Clopper–Pearson)."
+        yield f"All values at one end of their range, as availability 1: bound of {draws} in {draws} (Clopper–Pearson)."
 
 
 def _span(low: float, high: float, digits: int, sign: str = "") -> str:

@@ -317,7 +317,7 @@ def test_a_baseline_differs_by_nothing_and_cells_without_variation_say_so(paired
     always = {policy: {"availability": np.ones(10)} for policy in ("base", "same")}
     found = figures_of(always, "base", {"availability": FigureKind("availability", most=1.0)})
     assert found["same"]["availability"].low == pytest.approx(share_bounds(10, 10)[0])
-    assert "Values all at an end of their range have the exact bound of 10 in 10 (Clopper–Pearson)." in remarks(
+    assert "All values at one end of their range, as availability 1: bound of 10 in 10 (Clopper–Pearson)." in remarks(
         found, 10
     )
 
