@@ -173,7 +173,7 @@ def _sections(judged: Judged) -> Iterator[Section]:
     yield Section(key="failures", title="Failures and illegal actions", sentences=tuple(sentences), details=traces)
     hashes = [f"{digest}  {name}" for name, digest in judged.card["instances"].items()]
     about = "Every shift is a row of results.parquet beside this page; study.json has these hashes."
-    details = ((f"Hashes of {len(hashes)} scenarios", "\n".join(hashes)),)
+    details = ((f"Hashes of {len(hashes)} scenario{'s' * (len(hashes) > 1)}", "\n".join(hashes)),)
     yield Section(key="rows", title="How to repeat", sentences=(judged.command, about), details=details)
 
 
@@ -320,7 +320,8 @@ def _origin(judged: Judged) -> Table:
     """Code, versions, settings and policies of a study."""
     card = judged.card
     rows = [("code", str(card["code_hash"])), *((f"version of {k}", str(v)) for k, v in card["versions"].items())]
-    rows += [(name, value_text(card[name])) for name in ("risk", "channel", "randomise", "decision_limit_s")]
+    rows += [(name, value_text(card[name])) for name in ("risk", "decision_limit_s")]
+    rows += [("channel", judged.results[0].channel_text), ("randomise", judged.results[0].randomise.text)]
     for name, digest in card["policies"].items():
         without_file = "in another process, no file" if is_on_bus(name) else "of the code"
         rows.append((f"policy {label(name)}", digest or without_file))

@@ -230,6 +230,8 @@ def test_randomised_shifts_have_no_normalised_scores(study: Study):
     assert varied.values is None
     assert "Randomisation: ambient temperature +0 to +5 K." in comparison_page(varied)
     assert "Randomisation: none." in comparison_page(plain)
+    assert re.search(r">randomise</t.>\s*<t.[^>]*>none<", comparison_page(plain))
+    assert "Hashes of 1 scenario<" in comparison_page(plain)
 
 
 def test_the_page_says_who_beats_whom_and_loads_nothing(study: Study):
