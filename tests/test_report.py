@@ -35,7 +35,7 @@ from scenarios.show.run_page import (
     verdict,
 )
 from scenarios.show.timeline import shift_charts, stream_of
-from scenarios.show.words import offer_text
+from scenarios.show.words import duration, offer_text
 
 ARMS = ("arm_0", "arm_1")
 HOSTILE = '</script><img src="https://evil.example/x"><b>-001'
@@ -267,6 +267,17 @@ def test_decimation_keeps_both_extremes_the_ends_a_gap_and_the_limit(value: np.n
         assert (np.nanmin(value[kept]), np.nanmax(value[kept])) == (np.nanmin(value), np.nanmax(value))
 
 
+@pytest.mark.parametrize(("count", "names"), [(8, [f"s{n}" for n in range(8)]), (9, ["hold", "sort"])])
+def test_more_streams_than_colours_are_told_apart_by_kind(count: int, names: list[str]) -> None:
+    jobs = [{"name": f"s{n}", "kind": "hold" if n % 2 else "sort"} for n in range(count)]
+    run = RUN | {"scenario": RUN["scenario"] | {"jobs": jobs}}
+    arms = tuple(f"arm_{n}" for n in range(count))
+    events = tuple(Event(time_s=0.0, kind="award", arm=arm, job=f"s{n}-001") for n, arm in enumerate(arms))
+    bars = [trace for trace in drawn(page(run, events, arms=arms))["data"] if trace["x"] != [None]]
+    assert [trace["name"] for trace in bars] == names
+    assert len({trace["marker"]["color"] for trace in bars}) == len(names)
+
+
 def test_a_long_name_leaves_room_for_the_figure_and_is_no_template() -> None:
     arms = ("left_" + "W" * 120 + "_1", "%{meta.lane_title}")
     events = (Event(time_s=0.0, kind="award", arm=arms[0], job="q" * 120 + "-001"),)
@@ -309,6 +320,22 @@ def test_a_large_fleet_gets_a_heat_map_and_lanes_of_its_hottest_arms() -> None:
     go.Figure(shown)
 
 
+@pytest.mark.parametrize(
+    ("time_s", "text"),
+    [
+        (0, "0 s"),
+        (59.7, "1 min"),
+        (90, "1 min 30 s"),
+        (150, "2 min 30 s"),
+        (3240, "54 min"),
+        (3599.8, "1 h"),
+        (5430, "1 h 30 min"),
+    ],
+)
+def test_a_duration_below_an_hour_has_its_seconds(time_s: float, text: str) -> None:
+    assert duration(time_s) == text
+
+
 @pytest.mark.parametrize(("job", "stream"), [("sort_parts-001", "sort_parts"), ("a-b-2", "a-b"), ("lonely", "lonely")])
 def test_the_stream_of_a_job_stands_before_its_last_dash(job: str, stream: str) -> None:
     assert stream_of(job) == stream
@@ -348,7 +375,7 @@ def test_each_side_says_what_happened_and_what_became_of_the_job_on_the_other():
         ("bad", "round_robin: 1 fault"),
         ("good", "wsept: No fault, no late job"),
     ]
-    assert "arm_a stopped during crate, out for 13 min: the motor of joint 2 passed 75 °C" in burned
+    assert "arm_a stopped during crate, out for 13 min 20 s: the motor of joint 2 passed 75 °C" in burned
     assert "Under wsept, arm_b finished crate at 0:05:00 without a fault." in burned
     assert 'href="round_robin/report.html"' in page
     assert "Under" not in spared

@@ -143,9 +143,11 @@ def train_command(
     for k in range(seeds):
         where = out or Path("runs") / f"{name}-{seed + k}"
         done = train_one(where, seed + k, resume and (seeds == 1 or holds_training(where)))
+        first = "bid_price itself" if suite else f"imitation of {teacher} alone" if teacher else "an untrained network"
         say(
             f"{'Interrupted after' if done.interrupted else 'Trained'} {done.iterations} iterations, {done.seconds:.0f}"
-            f" s; best {'score' if suite else 'reward'} in validation {done.best:.4g}{'' if suite else ' a shift'}.",
+            f" s. Saved: iteration {done.kept}{'' if done.kept else f' ({first})'}, with the best "
+            f"validation: {'score' if suite else 'reward'} {done.best:.4g}{'' if suite else ' a shift'}.",
             out_console,
         )
         target = scenario if suite is None else "--suite test"  # the split validation chose the best of the training

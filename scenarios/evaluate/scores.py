@@ -63,7 +63,7 @@ class Normalised:
         cells, count = len(set(self.cells)), f"{len(self.instances)} instances"
         if self.groups is not None:
             return f"{count} of {cells} cells"
-        if cells == len(self.cells):
+        if FEWEST_CELLS <= cells == len(self.cells):
             return count
         return f"{count}, {f'these {cells} cells' if cells > 1 else 'this cell'} only"
 

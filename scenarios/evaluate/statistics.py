@@ -601,6 +601,10 @@ def remarks(figures: Mapping[str, Mapping[str, Figure]], draws: int) -> Iterator
         yield f"{EQUAL}: no variation in {draws}, at 95 % confidence up to {most:.0%} of all may differ."
     if any(note.endswith("Poisson") for note in notes):
         yield "Counts without an event have the exact bound of a Poisson mean."
+    if any(
+        f.note.startswith("no variation") and np.isfinite(f.low) for each in figures.values() for f in each.values()
+    ):
+        yield f"All values at one end of their range, as availability 1: bound of {draws} in {draws} (Clopper–Pearson)."
 
 
 def _span(low: float, high: float, digits: int, sign: str = "") -> str:

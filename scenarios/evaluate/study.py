@@ -355,6 +355,6 @@ def suite_of(name: str, seeds: int, first_seed: int = 0) -> list[Case]:
 
 
 def suite_label(name: str) -> str:
-    """What a table calls a suite: its name, or the first and the last of many instances."""
+    """What a table calls a suite: its name, or the first of many instances and the number of the others."""
     names = [each.strip() for each in name.split(",")]
-    return ", ".join(names) if len(names) <= MOST_NAMES else f"{names[0]} to {names[-1]}"
+    return ", ".join(names) if len(names) <= MOST_NAMES else f"{names[0]} and {len(names) - 1} others"

@@ -29,6 +29,7 @@ NO_SCORES = (
     "bounds, then compare with --references FILE."
 )
 NO_SCORES_RANDOMISED = "No normalised scores: references are of shifts without randomisation."
+CHOICE = "Intervals are not adjusted for the choice of the best policy; its significance is (Bonferroni)."
 MOST_CURVES = 8
 """Policies in the chart of profiles: the best ones, and the baseline."""
 MOST_FAILURES, MOST_TRACES = 20, 8
@@ -110,6 +111,12 @@ class Judged:
         """That differences refer to."""
         return self.results[0].baseline
 
+    @cached_property
+    def numbers(self) -> dict[str, int]:
+        """Number of each policy by its label, for one look in all charts; the first ones have different colours."""
+        order = (self.baseline, *(ranked(self.scores) if self.scores else ()), *self.results[0].scopes)
+        return {label(policy): number for number, policy in enumerate(dict.fromkeys(order))}
+
     @property
     def scored(self) -> Normalised | None:
         """Scores, if there are some of the baseline: it has none if it failed."""
@@ -151,8 +158,12 @@ def _sections(judged: Judged) -> Iterator[Section]:
         yield Section(key="cells", title="By cell or scenario", tables=(cells,), how=how)
     for number, result in enumerate(judged.results):
         where = f": {result.scenario}" if len(judged.results) > 1 else ""
-        if chart := _heat_chart(result, number):
-            yield Section(key=f"heat-{number}", title=f"Value against heat{where}", charts=(chart,))
+        if chart := _heat_chart(result, number, judged.numbers):
+            how = (
+                "Lines: 95 % interval of each mean, not paired; the paired differences to "
+                f"{label(result.baseline)} are in the table of all figures."
+            )
+            yield Section(key=f"heat-{number}", title=f"Value against heat{where}", charts=(chart,), how=how)
         key, title = f"figures-{number}", f"All figures{where}"
         if not result.figures:
             yield Section(key=key, title=title, failed=f"the baseline {label(result.baseline)} failed.")
@@ -170,15 +181,15 @@ def _sections(judged: Judged) -> Iterator[Section]:
     yield Section(key="failures", title="Failures and illegal actions", sentences=tuple(sentences), details=traces)
     hashes = [f"{digest}  {name}" for name, digest in judged.card["instances"].items()]
     about = "Every shift is a row of results.parquet beside this page; study.json has these hashes."
-    details = ((f"Hashes of {len(hashes)} scenarios", "\n".join(hashes)),)
+    details = ((f"Hashes of {len(hashes)} scenario{'s' * (len(hashes) > 1)}", "\n".join(hashes)),)
     yield Section(key="rows", title="How to repeat", sentences=(judged.command, about), details=details)
 
 
 def verdict(judged: Judged) -> list[str]:
-    """The best policy against the baseline and against the second best, in sentences.
+    """The best policy against the baseline and against the second best, and those below the baseline, in sentences.
 
     The best one is chosen by its figures, so p-values count as many differences as there are other policies
-    (Bonferroni).
+    (Bonferroni). p-values of those below the baseline are those of the table (Holm).
     """
     values, scores, base = judged.scored, judged.scores, judged.baseline
     failed = {each.policy for result in judged.results for each in result.failures}
@@ -187,7 +198,7 @@ def verdict(judged: Judged) -> list[str]:
     )
     last += [each for each in [_replaced_baseline(judged.results[0])] if each]
     if values is None or scores is None:
-        return [*_reward_verdict(judged.results), *last]
+        return [*_reward_verdict(judged.results), *([CHOICE] if len(judged.results[0].figures) > 1 else []), *last]
     best, *rest = ranked(scores)
     compared = [
         _against(other, values.difference(best, other), role, len(rest)) for other, role in _rivals(best, rest, base)
@@ -198,7 +209,20 @@ def verdict(judged: Judged) -> list[str]:
         f"{whose} is {scores.policies[best].mean.text()}, the best of {len(scores.policies)} policies, where 0 is "
         f"random and 1 the best schedule known for each of {scores.instances} instances."
     )
-    return [*sentences, *last]
+    sentences += _below({name: (each.difference, each.p_holm) for name, each in scores.policies.items()}, base)
+    return [*sentences, *([CHOICE] if compared else []), *last]
+
+
+def _below(differences: Mapping[str, tuple[Interval, float]], base: str) -> list[str]:
+    """The policies that are significantly worse than the baseline, in a sentence.
+
+    Args:
+        differences: Of each policy to the baseline, with the p-value after Holm's correction.
+    """
+    names = [
+        label(name) for name, (each, p_holm) in differences.items() if each.high < 0 and each.stars(p_holm) == "**"
+    ]
+    return [f"Significantly below the baseline {label(base)}: {', '.join(names)}."] if names else []
 
 
 def _rivals(best: str, others: Sequence[str], base: str) -> Iterator[tuple[str, str]]:
@@ -239,7 +263,9 @@ def _reward_verdict(results: Sequence[Comparison]) -> Iterator[str]:
             significant = difference.excludes_zero and _significant(difference.p, len(others))
             doubt = "" if significant else " (not significant)"
             more.append(f"{difference.text(1)} more than {role} {label(other)}{doubt}")
-        yield f"{where}{'; '.join([f'{label(best)} has the most reward, {reward}', *more])}."
+        rewards = {name: (each["reward"].to_base, each["reward"].p_holm) for name, each in result.figures.items()}
+        sentences = [f"{'; '.join([f'{label(best)} has the most reward, {reward}', *more])}.", *_below(rewards, base)]
+        yield where + " ".join(sentences)
 
 
 def _score_charts(judged: Judged) -> list[Chart]:
@@ -251,13 +277,14 @@ def _score_charts(judged: Judged) -> list[Chart]:
     means = [(label(name), scores.policies[name].mean) for name in order]
     rows = [(name, mean.mean, mean.low, mean.high) for name, mean in means]
     base = label(judged.baseline)
-    means_figure = spans(rows, "mean normalised score, 95 % interval", least=WORST, marked=base)
+    title = "mean normalised score, 95 % interval"
+    means_figure = spans(rows, judged.numbers, title, least=WORST, marked=base)
     chosen = order[:MOST_CURVES]
     if judged.baseline not in chosen:
         chosen = [*chosen[:-1], judged.baseline]
     bands = {label(name): profile(values.score[name], THRESHOLDS, groups=values.groups) for name in chosen}
     share = "share of instances above"
-    profiles = lines(THRESHOLDS, bands, {label(chosen[0]), base}, "normalised score", share)
+    profiles = lines(THRESHOLDS, bands, {label(chosen[0]), base}, judged.numbers, "normalised score", share)
     numbers = ", ".join(f"{name} {value:.2f}" for name, value, _, _ in rows)
     return [
         Chart(key="means", figure=means_figure, alt=f"mean normalised score: {numbers}"),
@@ -285,11 +312,11 @@ def _cell_table(judged: Judged) -> Table | None:
     return Table(head=head, rows=rows)
 
 
-def _heat_chart(result: Comparison, number: int) -> Chart | None:
+def _heat_chart(result: Comparison, number: int, numbers: Mapping[str, int]) -> Chart | None:
     """Value against heat; None without figures."""
     figures = {label(name): (each["peak_c"], each["value"]) for name, each in result.figures.items()}
     rows = [(name, (x.mean, x.low, x.high), (y.mean, y.low, y.high)) for name, (x, y) in figures.items()]
-    drawn = points(rows, "hottest motor, °C, mean over shifts", "value of finished jobs, mean over shifts")
+    drawn = points(rows, numbers, "hottest motor, °C, mean over shifts", "value of finished jobs, mean over shifts")
     alt = f"value of finished jobs against the hottest motor of {', '.join(figures)}"
     return Chart(key=f"heat_{number}", figure=drawn, alt=alt) if rows else None
 
@@ -302,18 +329,27 @@ def _origin(judged: Judged) -> Table:
     """Code, versions, settings and policies of a study."""
     card = judged.card
     rows = [("code", str(card["code_hash"])), *((f"version of {k}", str(v)) for k, v in card["versions"].items())]
-    rows += [(name, value_text(card[name])) for name in ("risk", "channel", "randomise", "decision_limit_s")]
+    rows += [(name, value_text(card[name])) for name in ("risk", "decision_limit_s")]
+    rows += [("channel", judged.results[0].channel_text), ("randomise", judged.results[0].randomise.text)]
     for name, digest in card["policies"].items():
         without_file = "in another process, no file" if is_on_bus(name) else "of the code"
         rows.append((f"policy {label(name)}", digest or without_file))
     return Table(head=("", ""), rows=tuple(rows), numbers=False)
 
 
-def spans(rows: Sequence[tuple[str, float, float, float]], title: str, *, least: float, marked: str = "") -> Figure:
+def spans(
+    rows: Sequence[tuple[str, float, float, float]],
+    numbers: Mapping[str, int],
+    title: str,
+    *,
+    least: float,
+    marked: str = "",
+) -> Figure:
     """A row for each name: a point and its interval.
 
     Args:
         rows: Name, value, low and high.
+        numbers: Of the look of each name.
         title: Of the axis.
         least: The axis begins here, so that one bad row does not squeeze the others; values below are written.
         marked: A name in bold.
@@ -329,8 +365,10 @@ def spans(rows: Sequence[tuple[str, float, float, float]], title: str, *, least:
         for y, value in enumerate(values[:, 0].tolist())
         if value < low - room
     ]
+    looks = [{"marker": {"color": charts.look_of(numbers[name])["color"], "size": 9}} for name in names]
+    dots = [_dots(values[[n]], at[[n]], [name], look) for n, (name, look) in enumerate(zip(names, looks, strict=True))]
     return {
-        "data": [_dots(values, at, names, {"marker": {"color": COLOURS[0], "size": 9}})],
+        "data": dots,
         "layout": LAYOUT
         | {"height": 12 + ROW_PX * len(rows) + MARGIN["b"], "margin": MARGIN | {"t": 12}}
         | {"annotations": cut, "showlegend": False}
@@ -342,6 +380,7 @@ def lines(
     x_values: Array,
     by_name: Mapping[str, tuple[Array, Array, Array]],
     banded: Collection[str],
+    numbers: Mapping[str, int],
     x_title: str,
     y_title: str,
 ) -> Figure:
@@ -351,25 +390,29 @@ def lines(
         x_values: [point].
         by_name: Value, low and high of each curve, [point].
         banded: Curves whose low and high are shown.
+        numbers: Of the look of each curve.
     """
     bands, curves = list[Trace](), list[Trace]()
-    for n, (name, (value, low, high)) in enumerate(by_name.items()):
+    for name, (value, low, high) in by_name.items():
+        look = charts.look_of(numbers[name])
         if name in banded:
-            bands.append(charts.band(x_values, low, high, charts.look_of(n)["color"], showlegend=False))
-        curves.append(charts.curve(plain(name, NAME), x_values, value, charts.look_of(n)))
+            bands.append(charts.band(x_values, low, high, look["color"], showlegend=False))
+        curves.append(charts.curve(plain(name, NAME), x_values, value, look))
     ends = {"range": x_values[[0, -1]].tolist()}
     axes = {"xaxis": axis(x_title, **ends), "yaxis": axis(y_title, range=[0, 1.02])}
     return {"data": [*bands, *curves], "layout": charts.WITH_LEGEND | axes}
 
 
-def points(rows: Sequence[tuple[str, Range, Range]], x_title: str, y_title: str) -> Figure:
+def points(rows: Sequence[tuple[str, Range, Range]], numbers: Mapping[str, int], x_title: str, y_title: str) -> Figure:
     """A point for each name, with its intervals.
 
     Args:
         rows: Name, x and y; each of the two with its lower and upper bound.
+        numbers: Of the look of each name.
     """
     data = list[Trace]()
-    for n, (name, x, y) in enumerate(rows):
+    for name, x, y in rows:
+        n = numbers[name]
         marker = {"color": COLOURS[n % len(COLOURS)], "symbol": SYMBOLS[n // len(COLOURS) % len(SYMBOLS)], "size": 9}
         data.append(_dots(np.array([x]), np.array([y]), [name], {"name": plain(name, NAME), "marker": marker}))
     return {"data": data, "layout": charts.WITH_LEGEND | {"xaxis": axis(x_title), "yaxis": axis(y_title)}}

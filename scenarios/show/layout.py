@@ -314,12 +314,16 @@ def _arms(scenario: Scenario) -> Table:
 def _jobs(scenario: Scenario) -> Table:
     """One row per stream, as sentences that fit any terminal."""
     rows = tuple(
-        (s.name, f"{_work(s)}\nworth {s.value:g}, due after {duration(s.due_s)}; {_arrivals(scenario, s)}")
+        (s.name, f"{_work(s)}\nworth {s.value:g}, {_due(s)}; {_arrivals(scenario, s)}")
         for s in scenario.jobs[:MOST_STREAMS]
     )
     more = len(scenario.jobs) - MOST_STREAMS
     notes = (f"… and {more} more.",) if more > 0 else ()
     return Table(head=("jobs", ""), rows=rows, numbers=False, notes=notes)
+
+
+def _due(stream: JobStream) -> str:
+    return f"{'expires' if stream.due == 'hard' else 'due'} after {duration(stream.due_s)}"
 
 
 def _work(stream: JobStream) -> str:

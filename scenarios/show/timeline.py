@@ -137,16 +137,24 @@ def stream_of(job: str) -> str:
     return job.rpartition("-")[0] or job
 
 
+def _groups(log: ShiftLog) -> dict[str, str]:
+    """What the bar of each job is called and coloured by: its stream, or its kind if there are more streams than
+    colours. Of all jobs, done or not, so that a stream has the same colour in every policy's report."""
+    groups = {event.job: stream_of(event.job) for event in log.events if event.job}
+    if len(set(groups.values())) <= len(STREAM_COLOURS):
+        return groups
+    kinds = {stream["name"]: stream["kind"] for stream in log.card.get("scenario", {}).get("jobs", ())}
+    return {job: kinds.get(job, kinds.get(stream, "other jobs")) for job, stream in groups.items()}
+
+
 def _work_bars(log: ShiftLog, unit_s: float) -> list[Trace]:
-    """Bars of every stream, then samples of the looks for the legend."""
-    assignments = log.plan.assignments
-    # Streams of all jobs, done or not, so that a stream has the same colour in every policy's report.
-    streams = sorted({stream_of(event.job) for event in log.events if event.job})
+    """Bars of every group of jobs, then samples of the looks for the legend."""
+    assignments, groups = log.plan.assignments, _groups(log)
     traces = []
-    for i, stream in enumerate(streams):
+    for i, group in enumerate(sorted(set(groups.values()))):
         # The legend shows the look of the first one: not that of a late or unfinished job.
         own = sorted(
-            (a for a in assignments if stream_of(a.job) == stream),
+            (a for a in assignments if groups[a.job] == group),
             key=lambda a: (bool(a.late_s), a.outcome != "finished"),
         )
         if not own:
@@ -161,7 +169,7 @@ def _work_bars(log: ShiftLog, unit_s: float) -> list[Trace]:
             # For people who see no colours and for dark pages, which show no dark outline.
             "pattern": HATCH | {"shape": ["/" if a.outcome == "returned" else "." if a.late_s else "" for a in own]},
         }
-        traces.append(_bars(plain(stream, STREAM_NAME), own, _assignment_text, log, unit_s, look))
+        traces.append(_bars(plain(group, STREAM_NAME), own, _assignment_text, log, unit_s, look))
     outcomes = {a.outcome for a in assignments}
     samples = (
         ("late", any(a.late_s for a in assignments), {"line": LATE, "pattern": HATCH | {"shape": "."}}),

@@ -31,11 +31,10 @@ def clock(time_s: float, begin: datetime | None = None) -> str:
 
 
 def duration(time_s: float) -> str:
-    """3 h, 54 min, 1 h 30 min, 20 s."""
-    hours, minutes = divmod(round(time_s / 60), 60)
-    if time_s < 60:
-        return f"{time_s:.0f} s"
-    return " ".join(f"{n} {unit}" for n, unit in ((hours, "h"), (minutes, "min")) if n)
+    """3 h, 1 h 30 min, 54 min, 2 min 30 s, 20 s; from an hour on in whole minutes."""
+    seconds = round(time_s) if time_s < 3600 else 60 * round(time_s / 60)
+    parts = ((seconds // 3600, "h"), (seconds // 60 % 60, "min"), (seconds % 60, "s"))
+    return " ".join(f"{n} {unit}" for n, unit in parts if n) or "0 s"
 
 
 def names_text(names: Sequence[str]) -> str:

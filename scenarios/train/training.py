@@ -53,8 +53,10 @@ class Trained:
     """Result of a training in all its sessions."""
 
     iterations: int
+    kept: int
+    """Iteration of the saved policy."""
     best: float
-    """Validation of the saved policy."""
+    """Its validation."""
     seconds: float
     interrupted: bool
 
@@ -88,7 +90,7 @@ def run_training(
         if not plan.in_total:
             raise FleetError(f"The training in '{out}' has {search.done} iterations: --iterations must be more.")
         tell(f"Skipped the training in '{out}', because it is complete.")
-        return Trained(search.done, best, before_s, interrupted=False)
+        return Trained(search.done, _kept(out), best, before_s, interrupted=False)
     out.mkdir(parents=True, exist_ok=True)
     log, interrupted, validated = TrainingLog(out), False, search.done
     began_s = time.monotonic() - before_s  # as if the sessions had followed each other
@@ -130,7 +132,13 @@ def run_training(
     if validated < search.done:
         validate()
     draw_curves([out], out / CURVE, learner.unit, learner.curves)
-    return Trained(search.done, best, time.monotonic() - began_s, interrupted)
+    return Trained(search.done, _kept(out), best, time.monotonic() - began_s, interrupted)
+
+
+def _kept(out: Path) -> int:
+    """The iteration of the saved policy: the first with the best validation."""
+    rows = [row for row in read_log(out) if "validation" in row]
+    return max(rows, key=lambda row: row["validation"])["iteration"]
 
 
 def holds_training(out: Path) -> bool:

@@ -112,13 +112,15 @@ def test_show_lists_the_cells_and_the_instances_of_a_split(thermofleet):
 
 
 def test_show_fits_eighty_columns_and_cuts_no_word(thermofleet, small_toml):
+    small_toml.write_text(small_toml.read_text().replace('kind = "hold"', 'kind = "hold"\ndue = "hard"\ndue_s = 150'))
     said = thermofleet("show", small_toml)
     assert said.code == 0
     assert max(len(line.rstrip()) for line in said.out.splitlines()) <= 80
     assert "…" not in said.out
     assert "hold 2 kg at bench, 1–2 × 10 s" in said.out
     assert "sort shelf → bench, 0.2 or 0.5 kg, 1–3 times" in said.out
-    assert "2 at 0 s" in said.out
+    assert "expires after 2 min 30 s; 2 at 0 s" in said.out
+    assert "due after 30 min; Poisson" in said.out
     assert "thermal load factor" in said.out
     assert json.loads(thermofleet("show", small_toml, "--json").out)["name"] == "heat"
 

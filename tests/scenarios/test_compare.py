@@ -31,7 +31,7 @@ from scenarios.evaluate.scores import Shift
 from scenarios.evaluate.sources import _Random
 from scenarios.evaluate.statistics import Figure
 from scenarios.evaluate.store import read_rows
-from scenarios.evaluate.study import Case, Row, RowKey, Study
+from scenarios.evaluate.study import Case, Row, RowKey, Study, suite_label
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.show.comparison_page import Judged, comparison_page, points, spans, verdict
 from scenarios.spec.load import load
@@ -161,6 +161,11 @@ def test_a_title_names_seeds_that_follow_each_other(seeds, title):
     assert result.title == title
 
 
+@pytest.mark.parametrize(("names", "text"), [("a, b,c", "a, b, c"), ("a,b,c,d", "a and 3 others"), ("test", "test")])
+def test_picked_instances_are_no_range(names, text):
+    assert suite_label(names) == text
+
+
 REWARD = {"wspt": 10.0, "wsept": 14.0, "fifo": 6.0}
 
 
@@ -214,16 +219,20 @@ def test_randomised_shifts_have_no_normalised_scores(study: Study):
     assert varied.values is None
     assert "Randomisation: ambient temperature +0 to +5 K." in comparison_page(varied)
     assert "Randomisation: none." in comparison_page(plain)
+    assert re.search(r">randomise</t.>\s*<t.[^>]*>none<", comparison_page(plain))
+    assert "Hashes of 1 scenario<" in comparison_page(plain)
 
 
 def test_the_page_says_who_beats_whom_and_loads_nothing(study: Study):
     rows = rows_of(study, "Oops: <script>alert(1)</script>")
     about = judged(study, rows, KNOWN_SHIFTS)
-    first, second, failed = verdict(about)
+    first, second, below, choice, failed = verdict(about)
     mean = np.mean([row.outcome.reward for row in rows[6:12] if row.outcome]) / 20
     better = mean - np.mean([row.outcome.reward for row in rows[:6] if row.outcome]) / 20
     assert first.startswith(f"wsept beats the baseline and next policy wspt by {better:.2f} [")
     assert second.startswith(f"Its mean score is {mean:.2f} [")
+    assert below == "Significantly below the baseline wspt: fifo."
+    assert choice.startswith("Intervals are not adjusted for the choice of the best policy")
     assert failed.startswith("Failed: random;")
     page = comparison_page(about)
     assert page == comparison_page(about)
@@ -235,8 +244,14 @@ def test_the_page_says_who_beats_whom_and_loads_nothing(study: Study):
     assert "Oops: &lt;script&gt;" in page
     assert "Illegal actions, which count as waits: wspt 12" in page
     assert page.count("data-drawn=") == len(drawn) == 3
-    for figure in drawn:
-        go.Figure(json.loads(figure))  # raises on any property or value that Plotly does not know
+    colours: dict[str, set[str]] = {}
+    for figure in map(json.loads, drawn):
+        go.Figure(figure)  # raises on any property or value that Plotly does not know
+        for trace in figure["data"]:
+            name = trace.get("name") or trace.get("customdata", [""])[0]
+            colours.setdefault(name, set()).add((trace.get("marker") or trace["line"]).get("color"))
+    assert {name: len(colours[name]) for name in ("wspt", "wsept", "fifo")} == {"wspt": 1, "wsept": 1, "fifo": 1}
+    assert len(set.union(*(colours[name] for name in ("wspt", "wsept", "fifo")))) == 3
 
 
 def test_the_first_policy_that_did_not_fail_takes_the_place_of_a_baseline_that_did(study: Study):
@@ -252,8 +267,8 @@ def test_the_best_of_several_must_be_significant_among_them(study: Study):
     (result,) = about.results
     assert result.lead is not None
     for p, said in ((0.016, "wspt."), (0.02, "wspt (not significant).")):  # of three
-        (only,) = verdict(replace(about, results=[replace(result, lead=replace(result.lead, p=p))]))
-        assert only.endswith(said)
+        first, _ = verdict(replace(about, results=[replace(result, lead=replace(result.lead, p=p))]))
+        assert said in first
 
 
 @pytest.mark.parametrize(
@@ -269,7 +284,10 @@ def test_the_verdict_names_the_baseline_and_the_policy_that_is_second(study: Stu
     """Of wsept 14, wspt 10, fifo 6 and random 0; the differences are those of the means."""
     rows = rows_of(study)
     means = {p: np.mean([r.outcome.reward for r in rows if r.key.policy == p and r.outcome]) for p in study.policies}
-    first, *_ = verdict(judged(study, rows, known, baseline))
+    first, *more = verdict(judged(study, rows, known, baseline))
+    worse = {"wspt": "fifo, random", "fifo": "random", "wsept": "wspt, fifo, random"}[baseline]
+    assert f"Significantly below the baseline {baseline}: {worse}." in " ".join([first, *more])
+    first = first.partition(" Significantly")[0]
     for other in others:
         more = means["wsept"] - means[other.split()[-1]]
         number = rf"{more / 20:.2f}" if known else rf"{more:.1f}"
@@ -280,25 +298,27 @@ def test_the_verdict_names_the_baseline_and_the_policy_that_is_second(study: Stu
 
 
 def test_without_references_the_verdict_is_of_rewards(study: Study):
-    (only,) = verdict(judged(study, rows_of(study), {}))
+    first, choice = verdict(judged(study, rows_of(study), {}))
+    assert choice.startswith("Intervals are not adjusted for the choice of the best policy")
     assert re.fullmatch(
         r"quickstart, 6 seeds, this fleet only: wsept has the most reward, 14\.\d; "
-        r"[34]\.\d \[[234]\.\d, [45]\.\d\] more than the baseline and next policy wspt\.",
-        only,
+        r"[34]\.\d \[[234]\.\d, [45]\.\d\] more than the baseline and next policy wspt\. .*",
+        first,
     )
 
 
 def test_charts_place_points_by_value():
-    chart = spans([("a", 0.0, -0.5, 0.5), ("b", 1.0, 0.9, 1.1), ("c", -9.0, -9.9, 2.0)], "score", least=-1.0)
-    (dots,) = chart["data"]
-    assert (dots["x"], dots["y"]) == ([0.0, 1.0, -9.0], [0, 1, 2])
-    assert dots["error_x"]["array"] == pytest.approx([0.5, 0.1, 11.0])
-    assert dots["error_x"]["arrayminus"] == pytest.approx([0.5, 0.1, 0.9])
+    numbers = {"a": 0, "b": 1, "c": 2}
+    chart = spans([("a", 0.0, -0.5, 0.5), ("b", 1.0, 0.9, 1.1), ("c", -9.0, -9.9, 2.0)], numbers, "score", least=-1.0)
+    dots = chart["data"]
+    assert [(dot["x"], dot["y"]) for dot in dots] == [([0.0], [0]), ([1.0], [1]), ([-9.0], [2])]
+    assert [dot["error_x"]["array"][0] for dot in dots] == pytest.approx([0.5, 0.1, 11.0])
+    assert [dot["error_x"]["arrayminus"][0] for dot in dots] == pytest.approx([0.5, 0.1, 0.9])
     assert chart["layout"]["xaxis"]["range"][0] > -2.0
     assert [(note["text"], note["y"]) for note in chart["layout"]["annotations"]] == [("◂ -9.00", 2)]
     unknown = float("nan")
     rows = [("a", (1.0, 0.5, 2.5), (2.0, unknown, unknown)), ("b", (1.0, 1.0, 1.0), (2.0, 2.0, 2.0))]
-    one, two = points(rows, "x", "y")["data"]
+    one, two = points(rows, numbers, "x", "y")["data"]
     assert (one["name"], one["error_x"]["array"], one["error_x"]["arrayminus"]) == ("a", [1.5], [0.5])
     assert (one["error_y"]["array"], two["error_y"]["arrayminus"]) == ([0.0], [0.0])
     assert one["marker"] != two["marker"]

@@ -21,7 +21,7 @@ from fleet.motion import Plan, drive
 from fleet.robot import ThermalLimits
 from fleet.seeding import shift_seeds
 from scenarios.evaluate.rollout import FIGURES, Outcome, outcomes
-from scenarios.evaluate.scores import normalised, references_of, scores_of
+from scenarios.evaluate.scores import Normalised, normalised, references_of, scores_of
 from scenarios.evaluate.statistics import interval
 from scenarios.evaluate.study import Case, Row, RowKey
 from scenarios.policy_loader import PolicyFailed, policy_of
@@ -287,6 +287,14 @@ def test_trainings_of_a_policy_are_a_sample_and_those_of_twins_are_not():
     given = interval(each.mean(axis=0))
     assert learned.mean.high - learned.mean.low > given.high - given.low
     assert scores_of(values, "a").remarks[0].startswith("Unit: 3 instances × 3 trainings of a policy.")
+
+
+@pytest.mark.parametrize(
+    ("cells", "unit"),
+    [("ab", "2 instances, these 2 cells only"), ("aa", "2 instances, this cell only"), ("abc", "3 instances")],
+)
+def test_fewer_than_three_cells_are_no_sample(cells, unit):
+    assert Normalised(instances=tuple("xyz"[: len(cells)]), cells=tuple(cells), score={}).unit == unit
 
 
 def test_shifts_without_a_reference_are_counted_and_failures_can_count_as_random():

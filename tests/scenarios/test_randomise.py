@@ -1,6 +1,7 @@
 """`--randomise` of `thermofleet compare` and `thermofleet train`."""
 
 import json
+import re
 from dataclasses import replace
 
 import pytest
@@ -151,7 +152,9 @@ def test_a_training_is_randomised_and_says_so(thermofleet, small_toml, tmp_path)
     how = ("train", small_toml, "--difficulty", "blind", "--envs", 2, "--iterations", 1)
     best = {}
     for name, more in (("hot", ("--randomise", "ambient_k=[20, 35]")), ("plain", ())):
-        assert thermofleet(*how, "--out", tmp_path / name, *more).code == 0
+        said = thermofleet(*how, "--out", tmp_path / name, *more)
+        assert said.code == 0
+        assert re.search(r"Saved: iteration (0 \(an untrained network\)|1),", said.out)
         first = json.loads((tmp_path / name / "progress.jsonl").read_text().splitlines()[0])
         best[name] = first["validation"]  # of the same network
         cards = [json.loads((tmp_path / name / file).read_text()) for file in ("training.json", "policy.json")]

@@ -57,7 +57,7 @@ def test_a_training_leaves_a_policy_its_log_and_its_curves(tmp_path, cache) -> N
     assert len(told) == 3, "of iteration 0, too"
     rows = [json.loads(line) for line in (out / LOG).read_text().splitlines()]
     judged = [row["validation"] for row in rows if "validation" in row]
-    assert done.best == max(judged)
+    assert (done.best, done.kept) == (max(judged), judged.index(max(judged)))
     assert [(row["number"], row["env_steps"]) for row in rows if "number" in row] == [(1, 4 * 16), (2, 2 * 4 * 16)]
     assert (out / CURVE).read_bytes().startswith(b"\x89PNG")
     assert type(policy_of(str(out))) is type(load_policy(out))
@@ -152,7 +152,7 @@ def test_a_training_leaves_a_central_policy_and_begins_with_its_teacher(tmp_path
     judged = [row["validation"] for row in rows if "validation" in row]
     assert len(told) == len(judged) == 3
     teacher = rows[0]["teacher"]
-    assert done.best == max(judged)
+    assert (done.best, done.kept) == (max(judged), judged.index(max(judged)))
     assert (out / CURVE).read_bytes().startswith(b"\x89PNG")
     assert scope_of(str(out)) == "central"
     with pytest.raises(FleetError, match="holds a training already"):

@@ -314,6 +314,12 @@ def test_a_baseline_differs_by_nothing_and_cells_without_variation_say_so(paired
         "all equal: no variation in 10, at 95 % confidence up to 31% of all may differ.",
         "Counts without an event have the exact bound of a Poisson mean.",
     ]
+    always = {policy: {"availability": np.ones(10)} for policy in ("base", "same")}
+    found = figures_of(always, "base", {"availability": FigureKind("availability", most=1.0)})
+    assert found["same"]["availability"].low == pytest.approx(share_bounds(10, 10)[0])
+    assert "All values at one end of their range, as availability 1: bound of 10 in 10 (Clopper–Pearson)." in remarks(
+        found, 10
+    )
 
 
 THRESHOLDS = np.linspace(0.0, 1.0, 5)
