@@ -269,7 +269,8 @@ def test_decimation_keeps_both_extremes_the_ends_a_gap_and_the_limit(value: np.n
 
 @pytest.mark.parametrize(("count", "names"), [(8, [f"s{n}" for n in range(8)]), (9, ["hold", "sort"])])
 def test_more_streams_than_colours_are_told_apart_by_kind(count: int, names: list[str]) -> None:
-    jobs = [{"name": f"s{n}", "kind": "hold" if n % 2 else "sort"} for n in range(count)]
+    arrivals = {"start_s": 0.0, "times_s": None}
+    jobs = [{"name": f"s{n}", "kind": "hold" if n % 2 else "sort", "arrivals": arrivals} for n in range(count)]
     run = RUN | {"scenario": RUN["scenario"] | {"jobs": jobs}}
     arms = tuple(f"arm_{n}" for n in range(count))
     events = tuple(Event(time_s=0.0, kind="award", arm=arm, job=f"s{n}-001") for n, arm in enumerate(arms))
