@@ -480,7 +480,7 @@ KEY_FIGURES = (
     KeyFigure("jobs finished", "finished", ",.4g", whole="jobs"),
     KeyFigure("value", "value", ",.4g", whole="value_offered"),
     KeyFigure("on time", "on_time", ",.4g", whole="finished"),
-    KeyFigure("tardiness of finished jobs", "tardiness_min", ",.1f", "min"),
+    KeyFigure("tardiness if finished", "tardiness_min", ",.1f", "min"),
     KeyFigure("jobs per hour", "jobs_per_hour", ".1f"),
     KeyFigure("faults", "faults", ".0f"),
     KeyFigure("contacts", "contacts", ",.0f"),

@@ -243,8 +243,8 @@ def test_a_report_of_logs_that_stay_cool_says_what_is_missing_and_leaves_with_co
     monkeypatch.setattr("scenarios.show.twin_report.SIZE", size)
     some = tmp_path / "logs"
     some.mkdir()
-    for day in ("monday", "tuesday", "friday"):
-        (some / f"{day}.csv").write_text(log_csv(60, celsius=31.0, seed=len(day)), encoding="utf-8")
+    for seed, day in enumerate(("monday", "tuesday", "friday")):
+        (some / f"{day}.csv").write_text(log_csv(60, celsius=31.0, seed=seed), encoding="utf-8")
     out = tmp_path / "report"
     said = thermofleet("twin", "report", "--log", some, "--seeds", 1, "--out", out)
     assert said.code == 1
