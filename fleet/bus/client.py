@@ -248,7 +248,7 @@ class BusClient(Connection):
             raise ValueError(f"'{key}' is answered with {channel.reply}, not with {kind}.")
         if self._participant is not None:
             self._check_may_query(self._participant, key)
-        pending = _PendingQuery(self, kind, most, each, done)
+        pending = _PendingQuery(self, kind, most, timeout_s, each, done)
         try:
             self._open().get(
                 key,
@@ -472,11 +472,13 @@ class _PendingQuery(Generic[Reply]):
         client: BusClient,
         kind: type[Reply],
         most: int,
+        timeout_s: float,
         each: Callable[[Reply], None],
         done: Callable[[Replies[Reply]], None],
     ) -> None:
         self.token = zenoh.CancellationToken()
         self._client, self._kind, self._most, self._each, self._done = client, kind, most, each, done
+        self._timeout_s = timeout_s
         self._replies: Replies[Reply] = Replies()
         self._start_s = time.monotonic()
         self._arrived = 0
@@ -518,6 +520,8 @@ class _PendingQuery(Generic[Reply]):
 
     def _complete(self) -> None:
         self._replies.took_s = time.monotonic() - self._start_s
+        if self._arrived == 0 and self._replies.took_s >= self._timeout_s:  # a timeout of the router states none
+            _add(self._replies.refused, "?", "")
         self._done(self._replies)
 
 

@@ -261,7 +261,7 @@ def test_a_forecast_follows_from_a_log_and_a_plan(thermofleet, small_toml, tmp_p
     plan.write_text(log_csv(40, celsius=30.0, seed=1), encoding="utf-8")
     said = thermofleet("twin", "forecast", "--log", log, "--plan", plan, "--repeat", 15, "--out", page)
     assert said.code == 0
-    assert re.search(r"After 15 repetitions, 10 min, joint \d is the hottest: [\d.]+ °C \(95 % interval", said.out)
+    assert re.search(r"After 15 repetitions, 9 min 52 s, joint \d is the hottest: [\d.]+ °C \(95 % interval", said.out)
     assert re.search(r"^60 °C +< 0\.005 ", said.out, re.MULTILINE)
     assert 'id="forecast_chart"' in page.read_text(encoding="utf-8")
     card = json.loads(thermofleet("twin", "forecast", "--log", log, "--plan", plan, "--json").out)
