@@ -201,8 +201,10 @@ class _Random:
     version: str = "random"
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty:
-        motion = hashlib.sha256(np.ascontiguousarray(plan.cycle.profile).tobytes()).digest()
-        entropy = [self.seed, repetitions, int.from_bytes(motion[:8], "little"), *plan.arm.encode()]
+        q = plan.cycle.profile[:, 0]
+        motion = np.round(1e4 * q[[0, len(q) // 3, 2 * len(q) // 3, -1]])  # the same on processors that round otherwise
+        digest = hashlib.sha256(motion.astype(np.int64).tobytes()).digest()
+        entropy = [self.seed, repetitions, len(q), int.from_bytes(digest[:8], "little"), *plan.arm.encode()]
         drawn = np.random.default_rng(np.random.SeedSequence(entropy)).random(JOINTS + 1)
         return Difficulty(drawn[:JOINTS], p_saturation=float(drawn[JOINTS]))
 

@@ -41,8 +41,12 @@ class ArmHardware(NamedTuple):
     thermal: ThermalModel
 
     def key(self, parts: Sequence[object], *data: bytes) -> str:
-        """Cache key of a model of this arm, which also depends on other values, as JSON, and data."""
-        values = (*vars(self.motors).values(), *vars(self.thermal).values())
+        """Cache key of a model of this arm, which also depends on other values, as JSON, and data.
+
+        It is the same on every processor: rates and modes, whose rounding depends on it, follow from the rest.
+        """
+        network = self.thermal
+        values = (*vars(self.motors).values(), network.capacity, network.laplacian, network.to_ambient)
         content = b"".join(np.asarray(value, dtype=float).tobytes() for value in values)
         return hashlib.sha256(msgspec.json.encode(parts) + content + b"".join(data)).hexdigest()[:32]
 

@@ -380,7 +380,9 @@ def test_random_scores_are_uniform_and_repeat() -> None:
     plans = [SimpleNamespace(arm="a", cycle=cycle) for cycle in cycles]
     drawn = np.array([[*score.per_joint, score.p_saturation] for score in (scores.score(each, 4) for each in plans)])
     assert stats.kstest(drawn.ravel(), "uniform").pvalue > 0.01
-    assert scores.score(plans[0], 4).per_joint.tolist() == drawn[0, :7].tolist()
+    other_processor = SimpleNamespace(arm="a", cycle=SimpleNamespace(profile=cycles[0].profile * (1.0 + 1e-14)))
+    for same in (plans[0], other_processor):
+        assert scores.score(same, 4).per_joint.tolist() == drawn[0, :7].tolist()
     assert _Random(4).score(plans[0], 4).per_joint.tolist() != drawn[0, :7].tolist()
 
 

@@ -2,12 +2,17 @@
 
 import json
 import tarfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fleet.difficulty import KNOWN, Difficulty
+from fleet.heat.motor import gen3_motors
+from fleet.heat.thermal import gen3_network, thermal_model
+from fleet.robot import Robot
+from scenarios.prepare.arms import ArmHardware
 from scenarios.prepare.fleet import Fleet, prepare
 from scenarios.prepare.shipped import FOLDER, SCENARIOS, archive_of, unpack_shipped
 
@@ -34,6 +39,15 @@ def test_nothing_of_quickstart_is_computed(tmp_path: Path, monkeypatch: pytest.M
     fleet = prepare_shipped(tmp_path, monkeypatch)
     assert [arm.robot.name for arm in fleet.arms] == ["arm_0", "arm_1", "arm_2", "arm_3"]
     assert {path.name for path in tmp_path.iterdir()} == {"identified", "plans", "saturation", "shipped", "twins"}
+
+
+def test_keys_do_not_depend_on_the_rounding_of_eigenvectors() -> None:
+    """LAPACK gives others on other processors."""
+    hardware = ArmHardware(Robot(name="a"), gen3_motors(), thermal_model(gen3_network()))
+    other = hardware.thermal.modes * (1.0 - 1e-15)
+    assert hardware._replace(thermal=replace(hardware.thermal, modes=other)).key([1]) == hardware.key([1])
+    warmer = replace(hardware.motors, idle_w=hardware.motors.idle_w + 1e-15)
+    assert hardware._replace(motors=warmer).key([1]) != hardware.key([1])
 
 
 def test_another_scenario_gets_nothing(tmp_path: Path) -> None:
