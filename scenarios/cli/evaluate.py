@@ -15,7 +15,7 @@ from fleet.errors import FleetError
 from fleet.fields import MAX_SEED, argument, option
 from scenarios.cli import options
 from scenarios.cli.options import From, Given
-from scenarios.result_folder import disk_errors, new_file
+from scenarios.result_folder import check_folder, disk_errors, new_file
 from scenarios.spec.options import Budget, RunSpec, StudySpec
 from scenarios.table import TABLE_FILES
 from scenarios.terminal import KEPT, echo, out_console, print_json, progress_bar, say
@@ -88,6 +88,8 @@ def train_command(
     varied = options.parse_randomisation(randomise)
     if seeds > 1 and out is not None:
         raise FleetError(f"--seeds {seeds} trains into folders of runs/: leave --out out (got {out}).")
+    if out is not None:
+        check_folder(out)
     if suite is not None or INSTANCE.fullmatch(scenario or ""):
         choose("training split", suite or (scenario or "").partition("/")[0], TrainingSplit)
     if suite is not None and algo is not None:
@@ -231,6 +233,8 @@ def compare_command(
     file, out = (out, None) if out and out.suffix.lower() in TABLE_FILES else (None, out)
     if file:
         options.check_table_file(file)
+    elif out:
+        check_folder(out, TABLE_FILES)
     cases = suite_of(suite, seeds or 1, first_seed) if suite else cases_of(scenario or [], seeds or 10, first_seed)
     channels = [options.channel_of(case.scenario, **channel) for case in cases]
     study = Study(

@@ -16,7 +16,7 @@ from fleet.job import BOUNDS
 from fleet.robot import POSTURES, RATING
 from scenarios.cli import options
 from scenarios.cli.options import From, Given
-from scenarios.result_folder import check_file, check_free, check_overwrite, new_file, new_folder
+from scenarios.result_folder import check_file, check_folder, check_free, check_overwrite, new_file, new_folder
 from scenarios.table import Table
 from scenarios.terminal import echo, out_console, print_json, print_wide, progress_bar, say
 from twin.vae.config import TwinConfig
@@ -53,9 +53,8 @@ def identify_command(
     from twin.thermal.checkpoint import CARD, save
     from twin.thermal.identify import AMBIENT_C, identify
 
-    if out is not None and out.exists():
-        if not out.is_dir():
-            raise FleetError(f"Cannot write to '{out}': it is a file; --out needs a folder.")
+    if out is not None:
+        check_folder(out)
         check_overwrite(out / CARD, overwrite)
     ambient_c = AMBIENT_C if ambient is None else ambient
     recordings = options.arm_recordings(log, arm, skip_damaged)
