@@ -260,7 +260,7 @@ def compare_command(
             (out / PAGE).write_text(comparison_page(judged), encoding="utf-8")
     if file:
         with new_file(file) as draft:
-            draft.write_bytes(figures_table(results).content(file.suffix.lower()))
+            draft.write_bytes(figures_table(results, judged.scores).content(file.suffix.lower()))
     if as_json:
         print_json(results[0] if len(results) == 1 else results)
         return

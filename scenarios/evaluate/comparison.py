@@ -1,7 +1,7 @@
 """Several policies on the same seeds: figures with paired differences, and scores."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +26,15 @@ if TYPE_CHECKING:  # slow to import
     from scenarios.evaluate.references import ShiftReference
 
 Array = np.ndarray
+
+SCORE_HEADINGS = {
+    "mean": "normalised score",
+    "hot": "normalised score, heat binds",
+    "cool": "normalised score, it does not",
+    "iqm": "normalised score, IQM",
+    "improvement": "normalised score, better in",
+}
+"""In a file of figures, by field of `Score`."""
 
 
 @dataclass(frozen=True)
@@ -107,19 +116,38 @@ class Comparison:
         return str(self.table.html())
 
 
-def figures_table(results: Sequence[Comparison]) -> Table:
-    """Every figure of every policy as a number in its own cell, for a file of a spreadsheet; "" where there is none."""
+def figures_table(results: Sequence[Comparison], scores: SuiteScores | None = None) -> Table:
+    """Every figure of every policy as a number in its own cell, for a file of a spreadsheet; "" where there is none.
+
+    Args:
+        scores: Normalised scores over all results; of several results their scenario is "all".
+    """
     names = ("mean", "low", "high", "difference", "difference_low", "difference_high", "p", "p_holm")
     rows = [
         (
             *(result.scenario, kind.heading, label(policy), label(result.baseline)),
-            *("" if np.isnan(value := getattr(figures[name], each)) else f"{value:.6g}" for each in names),
+            *_numbers(*(getattr(figures[name], each) for each in names)),
         )
         for result in results
         for name, kind in KINDS.items()
         for policy, figures in result.figures.items()
     ]
+    if scores:
+        where, base = results[0].scenario if len(results) == 1 else "all", label(scores.baseline)
+        for policy, score in scores.policies.items():
+            change = score.difference
+            of_mean = (change.mean, change.low, change.high, change.p, score.p_holm)
+            for field_name, heading in SCORE_HEADINGS.items():
+                if each := getattr(score, field_name):
+                    more = of_mean if field_name == "mean" else (np.nan,) * len(of_mean)
+                    numbers = _numbers(each.mean, each.low, each.high, *more)
+                    rows.append((where, heading, label(policy), base, *numbers))
     return Table(head=("scenario", "figure", "policy", "baseline", *names), rows=tuple(rows))
+
+
+def _numbers(*values: float) -> Iterator[str]:
+    """Cells of numbers; "" for NaN."""
+    return ("" if np.isnan(value) else f"{value:.6g}" for value in values)
 
 
 def compare(

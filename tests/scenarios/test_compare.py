@@ -348,6 +348,20 @@ def test_an_exported_figure_is_a_number_and_a_name_is_no_formula(study: Study):
     assert table.content(".csv").decode().count("\n") == 1 + len(table.rows)
 
 
+def test_an_export_has_the_normalised_scores_of_the_page(study: Study):
+    of_all = judged(study, rows_of(study), KNOWN_SHIFTS)
+    assert of_all.scores is not None
+    table = figures_table(of_all.results, of_all.scores)
+    score = of_all.scores.policies["wsept"]
+    (row,) = (row for row in table.rows if row[1:3] == ("normalised score", "wsept"))
+    assert [float(cell) for cell in row[4:8]] == pytest.approx(
+        [score.mean.mean, score.mean.low, score.mean.high, score.difference.mean], rel=1e-5
+    )
+    assert row[0] == of_all.results[0].scenario
+    twice = figures_table([*of_all.results] * 2, of_all.scores).rows
+    assert {row[0] for row in twice if row[1].startswith("normalised score")} == {"all"}
+
+
 def test_only_texts_that_a_spreadsheet_would_compute_get_an_apostrophe():
     formulas = ("=1+1", "+49 30", "-2+3", "@SUM(A1)", " =x", '=HYPERLINK("a")')
     plain = ("-3.5", "+1", "-12 %", "-1,234.5", "1e-5", "4711/10", "–", "a=b", "")
