@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fleet.bus.exchange.channel import PERFECT, Channel
+from fleet.env.validation import seed_of
 from fleet.errors import FleetError
 from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
 from scenarios.evaluate.scores import Normalised, Shift, SuiteScores, and_trainings, normalised, scores_of
@@ -190,6 +191,11 @@ def compare(
         check_name(policy)
     if isinstance(seeds, str) or not isinstance(seeds, Sequence):
         raise FleetError(f"seeds must be a list of integers, for example range(3) (got {seeds!r}).")
+    try:
+        for seed in seeds:
+            seed_of(seed)
+    except ValueError as error:
+        raise FleetError(str(error)) from error
     if twice := [seed for seed, count in Counter(seeds).items() if count > 1]:
         raise FleetError(f"Seed {twice[0]} is given twice: a repeated shift is no new evidence. Give each seed once.")
     if not policies or not seeds:
