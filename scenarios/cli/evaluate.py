@@ -218,6 +218,7 @@ def compare_command(
     from scenarios.evaluate.runner import run_study
     from scenarios.evaluate.scores import references_of
     from scenarios.evaluate.study import Study, cases_of, suite_label, suite_of
+    from scenarios.policy_loader import label
     from scenarios.show.comparison_page import Judged, comparison_page, result_text, verdict
 
     if bool(scenario) == bool(suite):
@@ -253,7 +254,8 @@ def compare_command(
         rows = run_study(study, out=out, workers=workers or -1, ray=ray, progress=progress, tell=say)
     results = comparisons(study, rows, base, suite, known)
     values = scores_over_all(study, rows, known)
-    title = f"Comparison of {len(names)} policies on {suite_label(suite or ','.join(case.name for case in cases))}"
+    compared = f"{len(names)} policies" if len(names) > 1 else label(base)
+    title = f"Comparison of {compared} on {suite_label(suite or ','.join(case.name for case in cases))}"
     judged = Judged(title=title, results=results, values=values, card=study.card, command=options.command_line(ctx))
     if out:
         with disk_errors(out):

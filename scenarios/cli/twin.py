@@ -250,7 +250,7 @@ def generate_command(
         return
     reasons = ", ".join(f"{reason} {times}" for reason, times in made.rejected.items()) or "none"
     cool = f"{made.truly_cool:.1%} truly stay below {made.verification.cool_c:g} °C"
-    say(f"{len(made.motions)} motions of {made.arm} in {out}; {cool}; rejected: {reasons}.", out_console)
+    say(f"Motions of {made.arm} in {out}: {len(made.motions)}; {cool}; rejected: {reasons}.", out_console)
     if len(made.motions) < count:
         say(f"Only {len(made.motions)} of {count} passed; choose a smaller --s or a lighter task.")
 
@@ -386,7 +386,7 @@ def train_command(
     if log is not None:
         count = card["twins"][0]["calibrated_on"]
         alpha = f"verdicts with --alpha {1 / (count + 1):.2g} or more" if count else "no verdicts"
-        say(f"{count} cool recordings held out (--hold-out): {alpha}; --alpha 0.05 needs 19.", out_console)
+        say(f"Cool recordings held out (--hold-out): {count}, {alpha}; --alpha 0.05 needs 19.", out_console)
     say(f"Written to {out}; score with: thermofleet twin score {out}", out_console)
 
 
@@ -507,7 +507,7 @@ def follow_log(twins: Path, arm: str | None, log: Path, how: str, skip_damaged: 
                 text = window_text(row, how)
                 echo(text if how != "csv" or count == 0 else text.splitlines()[1])
                 count += 1
-    stop.leave(f"Scored {count} windows of {first_s:g} s.")
+    stop.leave(f"Scored {count} window{'s' * (count != 1)} of {first_s:g} s.")
 
 
 def check_source(scenario: str | None, log: Path | None) -> None:

@@ -88,7 +88,7 @@ class Comparison:
         """What was compared, with the seeds if they follow each other."""
         first, last = self.seeds[0], self.seeds[-1]
         consecutive = self.seeds == tuple(range(first, first + len(self.seeds)))
-        seeds = f", seeds {first} to {last}" if consecutive else ""
+        seeds = f", seed {first}" if first == last else f", seeds {first} to {last}" if consecutive else ""
         return f"{self.scenario}{seeds} ({self.unit})"
 
     @property
@@ -199,7 +199,9 @@ def compare(
     if twice := [seed for seed, count in Counter(seeds).items() if count > 1]:
         raise FleetError(f"Seed {twice[0]} is given twice: a repeated shift is no new evidence. Give each seed once.")
     if not policies or not seeds:
-        raise FleetError(f"A comparison needs a policy and a seed (got {len(policies)} policies, {len(seeds)} seeds).")
+        raise FleetError(
+            f"A comparison needs a policy and a seed (got policies: {len(policies)}, seeds: {len(seeds)})."
+        )
     if workers < 1 and workers != -1:
         raise FleetError(f"workers must be >= 1, or -1 for one per core (got {workers}).")
     study = Study(

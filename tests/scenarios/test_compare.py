@@ -89,7 +89,7 @@ def test_figures_are_means_over_seeds_with_intervals_around_them(scenario, plans
     ("changes", "sentence"),
     [
         ({"policies": ("rnd", "round_robin")}, "No policy 'rnd'; did you mean 'random'?"),
-        ({"policies": ()}, "A comparison needs a policy and a seed (got 0 policies, 3 seeds)."),
+        ({"policies": ()}, "A comparison needs a policy and a seed (got policies: 0, seeds: 3)."),
         ({"policies": ("random", "random")}, "The policy 'random' is given twice"),
         ({"baseline": "coolest_first"}, "The baseline 'coolest_first' is not among the policies compared: random, "),
     ],
@@ -333,6 +333,7 @@ def test_a_comparison_is_one_table_in_every_form(study: Study):
     assert f"| wsept | {figure.mean:.1f} |" in markdown
     assert f"reward,wsept,{figure.mean:.1f}," in lines
     assert result._repr_html_() == html
+    assert replace(result, seeds=(7,)).title.startswith(f"{result.scenario}, seed 7 (")
 
 
 def test_an_exported_figure_is_a_number_and_a_name_is_no_formula(study: Study):

@@ -243,7 +243,7 @@ def _numbers(line: str, names: Sequence[str], separator: str) -> list[float]:
     """
     cells = line.replace('"', "").split(separator)
     if len(cells) != len(names):
-        raise ValueError(f"{len(cells)} fields where the header has {len(names)}")
+        raise ValueError(f"{len(cells)} field{'s' * (len(cells) > 1)} where the header has {len(names)}")
     numbers: list[float] = []
     for column, (cell, name) in enumerate(zip(cells, names, strict=True), start=1):
         try:
