@@ -214,8 +214,11 @@ def _with_tables(raw: Mapping[str, object], path: Path) -> Mapping[str, object]:
     zone = zone_of(raw.get("time_zone"), f"{path.name}: time_zone")
     begin = shift_begin(raw.get("shift_begin"), f"{path.name}: shift_begin", zone)
     places, horizon_s = raw.get("places"), raw.get("horizon_s")
+    least_s = raw.get("decision_interval_s", Scenario.decision_interval_s)
     # Their own faults are reported when the scenario is made.
-    horizon_s = float(horizon_s) if isinstance(horizon_s, int | float) and 0 < horizon_s < MOST_S else 0.0
+    if not isinstance(horizon_s, int | float) or not isinstance(least_s, int | float):
+        horizon_s = 0.0
+    horizon_s = float(horizon_s) if 0 < horizon_s < MOST_S and least_s <= horizon_s else 0.0
     raw = with_calendar(raw, begin, horizon_s, path.name) | {"shift_begin": begin and begin.isoformat()}
     jobs = raw.get("jobs")
     if not isinstance(jobs, list) or not any(isinstance(each, Mapping) and "table" in each for each in jobs):
