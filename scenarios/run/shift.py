@@ -17,7 +17,7 @@ from fleet.errors import FleetError, nearest
 from fleet.events import Event
 from fleet.observation import Observation
 from fleet.telemetry import Readings, Telemetry
-from scenarios.policy_loader import OnBus, blaming, check_name, policy_at
+from scenarios.policy_loader import OnBus, blaming, check_name, policy_at, scope_of
 from scenarios.prepare.fleet import Fleet, env_of, let_plan, prepare
 from scenarios.progress import Progress, quiet
 from scenarios.result_folder import new_folder
@@ -70,6 +70,8 @@ def run(
     elif options:
         raise FleetError(f"Give either a RunSpec or single options, not both (got {', '.join(options)}).")
     check_name(spec.policy)
+    with blaming(spec.policy, "loading"):  # before the fleet is prepared for minutes
+        scope_of(spec.policy)
     if not isinstance(fleet, Fleet):
         fleet = prepare(fleet, difficulty=spec.difficulty, risk=spec.risk, progress=progress)
     if out is not None:

@@ -84,6 +84,17 @@ def test_arguments_of_a_shift_are_checked():
         tf.prepare("quickstart", training=1.5)
 
 
+def test_a_policy_that_needs_arguments_is_refused_before_a_preparation(tmp_path, monkeypatch):
+    monkeypatch.delattr("scenarios.run.shift.prepare")
+    own = tmp_path / "mine.py"
+    own.write_text("from agents.rules import RoundRobin\nclass Mine(RoundRobin):\n def __init__(self, gain): ...\n")
+    says = "missing a required argument: 'gain'.*: give its parameters defaults"
+    with pytest.raises(FleetError, match=says):
+        tf.run("quickstart", policy=f"{own}:Mine")
+    with pytest.raises(FleetError, match=says):
+        tf.compare("quickstart", [f"{own}:Mine"], workers=1)
+
+
 def test_an_allowed_name_is_listed_once():
     with pytest.raises(FleetError, match="Allowed: ambient, arms, bids, breaks, bus, cache, "):
         tf.make_env("quickstart", slot=3)
