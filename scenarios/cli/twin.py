@@ -377,6 +377,7 @@ def train_command(
             arms = range(len(of_scenario.arms)) if arm is None else [of_scenario.index_of(arm)]
             twins = train_arms(of_scenario, list(arms), config, seed, progress)
             source = f"scenario {of_scenario.name}"
+        progress("writing", 0.0)
         card = save_twins(twins, folder, source)
     if as_json:
         print_json({"out": str(out), **card})
@@ -570,6 +571,7 @@ def report_command(
             subjects = twin_report.scenario_subjects(chosen, index, range(seeds), **how, progress=progress)
         chapters = twin_report.chapters_of(subjects, twin_report.SIZE, progress)
         origin = {"command": f"thermofleet twin report {source} --seeds {seeds}", **twin_report.origin_of(subjects)}
+        progress("writing", 0.0)
         failed = twin_report.write(chapters, origin, folder, title)
     if as_json:
         echo((out / twin_report.CARD).read_text(encoding="utf-8"), nl=False)
