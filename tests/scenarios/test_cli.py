@@ -123,6 +123,17 @@ def test_show_fits_eighty_columns_and_cuts_no_word(thermofleet, small_toml):
     assert "due after 30 min; Poisson" in said.out
     assert "thermal load factor" in said.out
     assert json.loads(thermofleet("show", small_toml, "--json").out)["name"] == "heat"
+    assert "Without work" not in said.out
+    for limits, sentence in (
+        (
+            "restart_c = 20\nwarning_c = 30",
+            "Without work, motors of left and right are above the warning limit of 30 °C at",
+        ),
+        ("restart_c = 20\nwarning_c = 25\nerror_c = 30", "above the error limit of 30 °C at"),
+    ):
+        low = small_toml.with_name("low.toml")
+        low.write_text(f"{small_toml.read_text()}\n[limits]\n{limits}\n")
+        assert sentence in " ".join(thermofleet("show", low).out.split())
 
 
 def test_compare_prints_a_table_or_json_against_round_robin_or_the_first_policy(thermofleet, small_toml, monkeypatch):
