@@ -367,7 +367,7 @@ def train_command(
     with explain_in_options(), bar as progress, new_folder(out, TWINS, overwrite=overwrite) as folder:
         if log is not None:
             config = config_of(size or "quick", given, of_log=True)
-            recordings = options.arm_recordings(log, arm, skip_damaged)
+            recordings = options.arm_recordings(log, arm, skip_damaged, progress=progress)
             twin = train_log(recordings, config, seed or 0, cool_c=cool, hold_out=hold_out, progress=progress)
             twins = [twin if arm is None else replace(twin, arm=arm)]
             source = f"log {log}"
@@ -558,7 +558,7 @@ def report_command(
         how: Any = {"size": twin_report.SIZE, "folder": cache_folder()}  # arguments
         if log is not None:
             title, source = f"The twin of the logs in {log.name}", f"--log {log.name}"
-            recordings = options.arm_recordings(log, arm, skip_damaged)
+            recordings = options.arm_recordings(log, arm, skip_damaged, progress=progress)
             subjects = list[twin_report.Subject]()
             for seed in range(seeds):
                 progress("training", Count(seed, seeds))

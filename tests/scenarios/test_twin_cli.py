@@ -91,7 +91,12 @@ def test_training_again_gives_the_same_twin_and_tells_its_quality(thermofleet, l
 
 
 @pytest.mark.parametrize(
-    ("step", "stage"), [("twin.vae.train.train", "learning the log"), ("scenarios.prepare.twins.save", "writing")]
+    ("step", "stage"),
+    [
+        ("twin.logs.reader.read_folder", "reading the log"),
+        ("twin.vae.train.train", "learning the log"),
+        ("scenarios.prepare.twins.save", "writing"),
+    ],
 )
 def test_ctrl_c_while_a_twin_of_a_log_is_made_promises_nothing(thermofleet, logs, tmp_path, monkeypatch, step, stage):
     def interrupted(*_args, **_more):
