@@ -124,7 +124,7 @@ def nearest(name: str, allowed: Iterable[str]) -> str:
     Returns:
         For example `; did you mean 'ambient_c'? Allowed: ambient_c, arms.`
     """
-    names = sorted(allowed)
+    names = sorted(set(allowed))
     close = get_close_matches(name, names, n=1)
     hint = f"; did you mean '{close[0]}'?" if close else "."
     return f"{hint} Allowed: {listed(names)}."

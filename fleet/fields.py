@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import cache
 from math import inf
+from numbers import Integral
 from typing import Any, Literal, get_args, get_origin
 
 from fleet.errors import NAME_RULE, is_name, nearest, printable
@@ -26,6 +27,7 @@ class Option:
     """Whether the value must be more than `low`, not equal to it."""
     choices: tuple[str, ...] = ()
     """Allowed names."""
+    is_integer: bool = False
     noun: str = ""
     """What an error calls one of these names; "" for the name of the field."""
     is_name: bool = False
@@ -63,6 +65,8 @@ class Option:
             return f"No {noun} '{printable(value)}'{nearest(value, self.choices)}"
         if self.is_name and isinstance(value, str) and value != default and not is_name(value):
             return f"{name} must have {NAME_RULE} (got '{printable(value)}')."
+        if self.is_integer and value is not None and (isinstance(value, bool) or not isinstance(value, Integral)):
+            return f"{name} must be an integer (got {value!r})."
         if isinstance(value, int | float) and not self._within(value):
             return f"{name} must be {self.limits} (got {value:g})."
         return ""
@@ -87,9 +91,11 @@ def argument(help: str, default: Any = MISSING, **more: Any) -> Any:
 def option_of(given: "Field[Any]", kind: Any) -> Option | None:
     """The option that a field or parameter of a type is; None of any other field.
 
-    The names of a Literal type are the allowed ones, unless others are given.
+    The names of a Literal type are the allowed ones, unless others are given; values of the type int are integers.
     """
     known: Option | None = given.metadata.get(_KEY)
+    if known and kind in (int, int | None):
+        return replace(known, is_integer=True)
     literal = next((each for each in (kind, *get_args(kind)) if get_origin(each) is Literal), None)
     return replace(known, choices=get_args(literal)) if known and literal and not known.choices else known
 

@@ -25,6 +25,8 @@ def decode_text(content: bytes) -> str:
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return content.decode("utf-16", errors="replace")
     text = content.decode("utf-8-sig", errors="surrogateescape")
+    if text.isascii():  # the search below takes seconds for 100 MB
+        return text
     return _NO_UTF8.sub(lambda found: found[0].encode("utf-8", "surrogateescape").decode("cp1252", "replace"), text)
 
 

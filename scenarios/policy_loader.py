@@ -53,10 +53,6 @@ class OnBus:
 ON_BUS = OnBus()
 
 
-class Unusable(FleetError):
-    """The class of a policy that cannot be made without arguments."""
-
-
 class PolicyFailed(FleetError):
     """A user-defined policy raised an exception or returned no action."""
 
@@ -107,8 +103,8 @@ def policy_of(name: str, bus: OnBus = ON_BUS) -> Policy:
     """A fresh policy for all arms.
 
     Raises:
-        FleetError: no such rule, file, module, class or folder, or one that is not a policy.
-        Unusable: its class needs arguments.
+        FleetError: no such rule, file, module, class or folder, one that is not a policy, or a class that needs
+            arguments.
     """
     return for_all_arms(_maker(name, bus))
 
@@ -309,7 +305,10 @@ def _made_by(name: str) -> tuple[Callable[[], Policy] | Callable[[], ArmPolicy],
     try:
         signature(found).bind()
     except TypeError as error:
-        raise Unusable(f"'{name}' must be a class or function that is called without arguments ({error}).") from error
+        raise FleetError(
+            f"'{name}' must be a class or function that is called without arguments ({error}): give its parameters "
+            "defaults."
+        ) from error
     example = found if isinstance(found, type) else found()
     scope = getattr(example, "scope", None)
     if scope not in SCOPES:

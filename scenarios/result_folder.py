@@ -128,10 +128,9 @@ def check_free(out: Path, kind: ResultKind, *, overwrite: bool) -> None:
         for parent in out.parents:
             if parent.exists() and not parent.is_dir():
                 raise FleetError(f"Cannot write to '{out}': '{parent}' is a file, not a folder.")
+        check_folder(out)
         if not out.exists():
             return
-        if not out.is_dir():
-            raise FleetError(f"Cannot write to '{out}': it is a file; --out needs a folder.")
         present = sorted(p.name for p in out.iterdir())
     status = _status(out / kind.card)
     foreign = [name for name in present if not status or not any(fnmatchcase(name, known) for known in kind.files)]
@@ -141,6 +140,27 @@ def check_free(out: Path, kind: ResultKind, *, overwrite: bool) -> None:
         )
     if status == "finished":
         check_overwrite(out, overwrite, f"holds a finished {kind.name}")
+
+
+_FILE_TYPES = re.compile(
+    r"\.(csv|tsv|xlsx?|ods|parquet|jsonl?|toml|yaml|txt|md|tex|pdf|html?|png|svg|jpe?g|gif|mp4|webm|mcap|glb|onnx|zip)",
+    re.IGNORECASE,
+)
+
+
+def check_folder(out: Path, files: Sequence[str] = ()) -> None:
+    """Raise a FleetError if `out`, the value of --out, is a file, or is new and ends as the name of one.
+
+    Args:
+        files: Endings of the files that the command writes in place of a folder.
+    """
+    if out.is_dir():
+        return
+    if out.exists():
+        raise FleetError(f"Cannot write to '{out}': it is a file; --out needs a folder.")
+    if _FILE_TYPES.fullmatch(out.suffix):
+        also = f", or a file that ends in {', '.join(files)}" if files else ""
+        raise FleetError(f"--out must be a folder, without the ending of a file{also} (got '{out}').")
 
 
 def check_overwrite(out: Path, overwrite: bool, what: str = "exists", option: str = "--out") -> None:

@@ -15,7 +15,7 @@ from fleet.errors import FleetError
 from fleet.fields import MAX_SEED, argument, option
 from scenarios.cli import options
 from scenarios.cli.options import From, Given
-from scenarios.result_folder import disk_errors, new_file
+from scenarios.result_folder import check_folder, disk_errors, new_file
 from scenarios.spec.options import Budget, RunSpec, StudySpec
 from scenarios.table import TABLE_FILES
 from scenarios.terminal import KEPT, echo, out_console, print_json, progress_bar, say
@@ -88,6 +88,8 @@ def train_command(
     varied = options.parse_randomisation(randomise)
     if seeds > 1 and out is not None:
         raise FleetError(f"--seeds {seeds} trains into folders of runs/: leave --out out (got {out}).")
+    if out is not None:
+        check_folder(out)
     if suite is not None or INSTANCE.fullmatch(scenario or ""):
         choose("training split", suite or (scenario or "").partition("/")[0], TrainingSplit)
     if suite is not None and algo is not None:
@@ -216,6 +218,7 @@ def compare_command(
     from scenarios.evaluate.runner import run_study
     from scenarios.evaluate.scores import references_of
     from scenarios.evaluate.study import Study, cases_of, suite_label, suite_of
+    from scenarios.policy_loader import label
     from scenarios.show.comparison_page import Judged, comparison_page, result_text, verdict
 
     if bool(scenario) == bool(suite):
@@ -231,6 +234,8 @@ def compare_command(
     file, out = (out, None) if out and out.suffix.lower() in TABLE_FILES else (None, out)
     if file:
         options.check_table_file(file)
+    elif out:
+        check_folder(out, TABLE_FILES)
     cases = suite_of(suite, seeds or 1, first_seed) if suite else cases_of(scenario or [], seeds or 10, first_seed)
     channels = [options.channel_of(case.scenario, **channel) for case in cases]
     study = Study(
@@ -249,14 +254,15 @@ def compare_command(
         rows = run_study(study, out=out, workers=workers or -1, ray=ray, progress=progress, tell=say)
     results = comparisons(study, rows, base, suite, known)
     values = scores_over_all(study, rows, known)
-    title = f"Comparison of {len(names)} policies on {suite_label(suite or ','.join(case.name for case in cases))}"
+    compared = f"{len(names)} policies" if len(names) > 1 else label(base)
+    title = f"Comparison of {compared} on {suite_label(suite or ','.join(case.name for case in cases))}"
     judged = Judged(title=title, results=results, values=values, card=study.card, command=options.command_line(ctx))
     if out:
         with disk_errors(out):
             (out / PAGE).write_text(comparison_page(judged), encoding="utf-8")
     if file:
         with new_file(file) as draft:
-            draft.write_bytes(figures_table(results).content(file.suffix.lower()))
+            draft.write_bytes(figures_table(results, judged.scores).content(file.suffix.lower()))
     if as_json:
         print_json(results[0] if len(results) == 1 else results)
         return

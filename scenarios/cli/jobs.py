@@ -72,8 +72,9 @@ def submit_command(
 
     table = file if file.lower().endswith(SUFFIXES) else ""
     if file:
-        places = places_of_cell(endpoint, fleet) if table and not quote else None
-        jobs = read_jobs(file, shift_begin, places)
+        jobs = read_jobs(file, shift_begin)
+        if table and not quote and (places := places_of_cell(endpoint, fleet)):  # waits for a router
+            jobs = read_jobs(file, shift_begin, places)
         first_s = min((job.release_s for job in jobs.values()), default=0.0)
         if first_s > 0 and not shift_begin:
             say(f"Times count from fleet time 0: the first job is released at {clock(first_s)}. See --shift-begin.")

@@ -58,7 +58,10 @@ def up_command(
     continues from the journals. With --arms it starts a part of the fleet.
     """
     from scenarios.live.fleet_processes import run_fleet
+    from scenarios.result_folder import check_folder
 
+    if out is not None:
+        check_folder(out)
     if webhook and not page:
         raise FleetError("--webhook is sent by the gateway of the page: add --page.")
     place = {"port": port, "tls": tls, "arms": arms, "router": router, "host": host}
@@ -209,8 +212,10 @@ def record_command(
     from fleet.bus.client import BusClient
     from fleet.live.policy_client import CONNECT_S
     from scenarios.live.recorder import BACKLOG, record
+    from scenarios.result_folder import check_folder
     from scenarios.signals import until_stopped
 
+    check_folder(out)
     with until_stopped() as stop, BusClient(endpoint, fleet, backlog=BACKLOG, stopped=stop.is_set) as link:
         echo(f"ready record {endpoint}")
         connect = partial(BusClient, endpoint, fleet, timeout_s=CONNECT_S, backlog=BACKLOG)

@@ -306,7 +306,8 @@ def _write_scene(run: Path, out: Path, every_s: float | None, speed: float) -> N
 
             write_gltf(file, moments, speed, progress)
             hint = f"{speed:g} × real time; open it in Blender or a web viewer"
-    say(f"Wrote {len(moments.poses)} moments, {out.stat().st_size / 1e6:.1f} MB: {out} ({hint}).", out_console)
+    count, megabytes = len(moments.poses), out.stat().st_size / 1e6
+    say(f"Wrote {count} moment{'s' * (count > 1)}, {megabytes:.1f} MB: {out} ({hint}).", out_console)
 
 
 def _write_film(run: Path, out: Path, shot: Shot) -> None:
@@ -336,7 +337,7 @@ def _write_film(run: Path, out: Path, shot: Shot) -> None:
 
         count = write_film(file, out.suffix[1:].lower(), counted(), shot)
     length_s, megabytes = count / shot.fps, out.stat().st_size / 1e6
-    say(f"Filmed {count} pictures, {length_s:.1f} s, {megabytes:.1f} MB: {out}.", out_console)
+    say(f"Filmed {count} picture{'s' * (count > 1)}, {length_s:.1f} s, {megabytes:.1f} MB: {out}.", out_console)
 
 
 def _size(asked: str) -> tuple[int, int]:

@@ -4,7 +4,7 @@ import inspect
 import shlex
 import tomllib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import MISSING, Field, dataclass, fields, replace
 from functools import wraps
 from pathlib import Path
@@ -21,6 +21,7 @@ from scenarios.table import TABLE_FILES
 
 if TYPE_CHECKING:  # slow to import
     from scenarios.prepare.randomisation import Randomisation
+    from scenarios.progress import Progress
     from scenarios.spec.schema import Scenario
     from twin.logs.recording import Recording
 
@@ -308,27 +309,34 @@ def the_fleet(name: str, endpoint: str) -> str:
     raise FleetError(f"There is no fleet at {endpoint} yet. Name the one to wait for with --fleet.")
 
 
-def recordings_of(log: Path, skip_damaged: bool, *, measured: bool = True) -> "list[Recording]":
+def recordings_of(
+    log: Path, skip_damaged: bool, *, measured: bool = True, progress: "Progress | None" = None
+) -> "list[Recording]":
     """The recordings of a log file, or of all logs in a folder.
 
     Args:
         measured: As in `twin.logs.reader.read`, of a file.
+        progress: Of the command; None for a bar of its own.
 
     Raises:
         FleetError: names file and line, and how to go on without them.
     """
+    from scenarios.terminal import progress_bar
     from twin.logs.reader import read, read_folder
 
     damaged = "skip" if skip_damaged else "refuse"
-    with explain_damage():
+    with explain_damage(), nullcontext(progress) if progress else progress_bar(kept="") as told:
+        told("reading the log", 0.0)
         return read_folder(log, damaged=damaged) if log.is_dir() else read(log, damaged=damaged, measured=measured)
 
 
-def arm_recordings(log: Path, arm: str | None, skip_damaged: bool, *, measured: bool = True) -> "list[Recording]":
+def arm_recordings(
+    log: Path, arm: str | None, skip_damaged: bool, *, measured: bool = True, progress: "Progress | None" = None
+) -> "list[Recording]":
     """The recordings of one arm; raises as `recordings_of` and `twin.logs.reader.of_arm`."""
     from twin.logs.reader import of_arm
 
-    return of_arm(recordings_of(log, skip_damaged, measured=measured), arm, log)
+    return of_arm(recordings_of(log, skip_damaged, measured=measured, progress=progress), arm, log)
 
 
 @contextmanager

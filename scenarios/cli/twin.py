@@ -16,7 +16,7 @@ from fleet.job import BOUNDS
 from fleet.robot import POSTURES, RATING
 from scenarios.cli import options
 from scenarios.cli.options import From, Given
-from scenarios.result_folder import check_file, check_free, check_overwrite, new_file, new_folder
+from scenarios.result_folder import check_file, check_folder, check_free, check_overwrite, new_file, new_folder
 from scenarios.table import Table
 from scenarios.terminal import echo, out_console, print_json, print_wide, progress_bar, say
 from twin.vae.config import TwinConfig
@@ -53,9 +53,8 @@ def identify_command(
     from twin.thermal.checkpoint import CARD, save
     from twin.thermal.identify import AMBIENT_C, identify
 
-    if out is not None and out.exists():
-        if not out.is_dir():
-            raise FleetError(f"Cannot write to '{out}': it is a file; --out needs a folder.")
+    if out is not None:
+        check_folder(out)
         check_overwrite(out / CARD, overwrite)
     ambient_c = AMBIENT_C if ambient is None else ambient
     recordings = options.arm_recordings(log, arm, skip_damaged)
@@ -251,7 +250,7 @@ def generate_command(
         return
     reasons = ", ".join(f"{reason} {times}" for reason, times in made.rejected.items()) or "none"
     cool = f"{made.truly_cool:.1%} truly stay below {made.verification.cool_c:g} °C"
-    say(f"{len(made.motions)} motions of {made.arm} in {out}; {cool}; rejected: {reasons}.", out_console)
+    say(f"Motions of {made.arm} in {out}: {len(made.motions)}; {cool}; rejected: {reasons}.", out_console)
     if len(made.motions) < count:
         say(f"Only {len(made.motions)} of {count} passed; choose a smaller --s or a lighter task.")
 
@@ -368,7 +367,7 @@ def train_command(
     with explain_in_options(), bar as progress, new_folder(out, TWINS, overwrite=overwrite) as folder:
         if log is not None:
             config = config_of(size or "quick", given, of_log=True)
-            recordings = options.arm_recordings(log, arm, skip_damaged)
+            recordings = options.arm_recordings(log, arm, skip_damaged, progress=progress)
             twin = train_log(recordings, config, seed or 0, cool_c=cool, hold_out=hold_out, progress=progress)
             twins = [twin if arm is None else replace(twin, arm=arm)]
             source = f"log {log}"
@@ -378,6 +377,7 @@ def train_command(
             arms = range(len(of_scenario.arms)) if arm is None else [of_scenario.index_of(arm)]
             twins = train_arms(of_scenario, list(arms), config, seed, progress)
             source = f"scenario {of_scenario.name}"
+        progress("writing", 0.0)
         card = save_twins(twins, folder, source)
     if as_json:
         print_json({"out": str(out), **card})
@@ -387,7 +387,7 @@ def train_command(
     if log is not None:
         count = card["twins"][0]["calibrated_on"]
         alpha = f"verdicts with --alpha {1 / (count + 1):.2g} or more" if count else "no verdicts"
-        say(f"{count} cool recordings held out (--hold-out): {alpha}; --alpha 0.05 needs 19.", out_console)
+        say(f"Cool recordings held out (--hold-out): {count}, {alpha}; --alpha 0.05 needs 19.", out_console)
     say(f"Written to {out}; score with: thermofleet twin score {out}", out_console)
 
 
@@ -508,7 +508,7 @@ def follow_log(twins: Path, arm: str | None, log: Path, how: str, skip_damaged: 
                 text = window_text(row, how)
                 echo(text if how != "csv" or count == 0 else text.splitlines()[1])
                 count += 1
-    stop.leave(f"Scored {count} windows of {first_s:g} s.")
+    stop.leave(f"Scored {count} window{'s' * (count != 1)} of {first_s:g} s.")
 
 
 def check_source(scenario: str | None, log: Path | None) -> None:
@@ -558,7 +558,7 @@ def report_command(
         how: Any = {"size": twin_report.SIZE, "folder": cache_folder()}  # arguments
         if log is not None:
             title, source = f"The twin of the logs in {log.name}", f"--log {log.name}"
-            recordings = options.arm_recordings(log, arm, skip_damaged)
+            recordings = options.arm_recordings(log, arm, skip_damaged, progress=progress)
             subjects = list[twin_report.Subject]()
             for seed in range(seeds):
                 progress("training", Count(seed, seeds))
@@ -571,6 +571,7 @@ def report_command(
             subjects = twin_report.scenario_subjects(chosen, index, range(seeds), **how, progress=progress)
         chapters = twin_report.chapters_of(subjects, twin_report.SIZE, progress)
         origin = {"command": f"thermofleet twin report {source} --seeds {seeds}", **twin_report.origin_of(subjects)}
+        progress("writing", 0.0)
         failed = twin_report.write(chapters, origin, folder, title)
     if as_json:
         echo((out / twin_report.CARD).read_text(encoding="utf-8"), nl=False)

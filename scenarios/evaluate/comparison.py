@@ -1,7 +1,7 @@
 """Several policies on the same seeds: figures with paired differences, and scores."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fleet.bus.exchange.channel import PERFECT, Channel
+from fleet.env.validation import seed_of
 from fleet.errors import FleetError
 from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
 from scenarios.evaluate.scores import Normalised, Shift, SuiteScores, and_trainings, normalised, scores_of
@@ -26,6 +27,15 @@ if TYPE_CHECKING:  # slow to import
     from scenarios.evaluate.references import ShiftReference
 
 Array = np.ndarray
+
+SCORE_HEADINGS = {
+    "mean": "normalised score",
+    "hot": "normalised score, heat binds",
+    "cool": "normalised score, it does not",
+    "iqm": "normalised score, IQM",
+    "improvement": "normalised score, better in",
+}
+"""In a file of figures, by field of `Score`."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +88,7 @@ class Comparison:
         """What was compared, with the seeds if they follow each other."""
         first, last = self.seeds[0], self.seeds[-1]
         consecutive = self.seeds == tuple(range(first, first + len(self.seeds)))
-        seeds = f", seeds {first} to {last}" if consecutive else ""
+        seeds = f", seed {first}" if first == last else f", seeds {first} to {last}" if consecutive else ""
         return f"{self.scenario}{seeds} ({self.unit})"
 
     @property
@@ -107,19 +117,38 @@ class Comparison:
         return str(self.table.html())
 
 
-def figures_table(results: Sequence[Comparison]) -> Table:
-    """Every figure of every policy as a number in its own cell, for a file of a spreadsheet; "" where there is none."""
+def figures_table(results: Sequence[Comparison], scores: SuiteScores | None = None) -> Table:
+    """Every figure of every policy as a number in its own cell, for a file of a spreadsheet; "" where there is none.
+
+    Args:
+        scores: Normalised scores over all results; of several results their scenario is "all".
+    """
     names = ("mean", "low", "high", "difference", "difference_low", "difference_high", "p", "p_holm")
     rows = [
         (
             *(result.scenario, kind.heading, label(policy), label(result.baseline)),
-            *("" if np.isnan(value := getattr(figures[name], each)) else f"{value:.6g}" for each in names),
+            *_numbers(*(getattr(figures[name], each) for each in names)),
         )
         for result in results
         for name, kind in KINDS.items()
         for policy, figures in result.figures.items()
     ]
+    if scores:
+        where, base = results[0].scenario if len(results) == 1 else "all", label(scores.baseline)
+        for policy, score in scores.policies.items():
+            change = score.difference
+            of_mean = (change.mean, change.low, change.high, change.p, score.p_holm)
+            for field_name, heading in SCORE_HEADINGS.items():
+                if each := getattr(score, field_name):
+                    more = of_mean if field_name == "mean" else (np.nan,) * len(of_mean)
+                    numbers = _numbers(each.mean, each.low, each.high, *more)
+                    rows.append((where, heading, label(policy), base, *numbers))
     return Table(head=("scenario", "figure", "policy", "baseline", *names), rows=tuple(rows))
+
+
+def _numbers(*values: float) -> Iterator[str]:
+    """Cells of numbers; "" for NaN."""
+    return ("" if np.isnan(value) else f"{value:.6g}" for value in values)
 
 
 def compare(
@@ -162,10 +191,17 @@ def compare(
         check_name(policy)
     if isinstance(seeds, str) or not isinstance(seeds, Sequence):
         raise FleetError(f"seeds must be a list of integers, for example range(3) (got {seeds!r}).")
+    try:
+        for seed in seeds:
+            seed_of(seed)
+    except ValueError as error:
+        raise FleetError(str(error)) from error
     if twice := [seed for seed, count in Counter(seeds).items() if count > 1]:
         raise FleetError(f"Seed {twice[0]} is given twice: a repeated shift is no new evidence. Give each seed once.")
     if not policies or not seeds:
-        raise FleetError(f"A comparison needs a policy and a seed (got {len(policies)} policies, {len(seeds)} seeds).")
+        raise FleetError(
+            f"A comparison needs a policy and a seed (got policies: {len(policies)}, seeds: {len(seeds)})."
+        )
     if workers < 1 and workers != -1:
         raise FleetError(f"workers must be >= 1, or -1 for one per core (got {workers}).")
     study = Study(

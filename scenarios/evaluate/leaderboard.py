@@ -176,12 +176,12 @@ def _problems_of_shifts(submission: BoardResult, references: Mapping[Shift, Shif
     given = {(row.instance, row.training) for row in submission.rows}
     wanted = {(name, training) for name in lines for training in range(submission.card.trainings)}
     if len(given) < len(submission.rows):
-        yield f"{len(submission.rows) - len(given)} shifts are given twice"
+        yield f"shifts given twice: {len(submission.rows) - len(given)}"
     if wanted - given:
         name, training = min(wanted - given)
         yield f"{len(wanted - given)} of {len(wanted)} shifts are missing, the first {name}, training {training}"
     if given - wanted:
-        yield f"{len(given - wanted)} shifts are not of the split {split}, the first {min(given - wanted)[0]}"
+        yield f"shifts not of the split {split}: {len(given - wanted)}, the first {min(given - wanted)[0]}"
     for row in submission.rows:
         if line := lines.get(row.instance):
             problems = _problems_of_shift(row, line, references.get((row.instance, line.seed)))

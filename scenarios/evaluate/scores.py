@@ -122,7 +122,7 @@ class SuiteScores:
             "hindsight, the best known schedule; the unit is at least a tenth of its reward."
         ]
         if self.missing:
-            remarks.append(f"{self.missing} shifts of each policy have no reference and are not scored.")
+            remarks.append(f"Shifts of each policy without a reference, which are not scored: {self.missing}.")
         return remarks
 
 

@@ -15,7 +15,7 @@ from fleet.files import atomic_path
 from scenarios.evaluate.rollout import FIGURES
 from scenarios.evaluate.study import CARD, Row, RowKey, columns, row_of
 from scenarios.json_rows import Rows
-from scenarios.result_folder import disk_errors, lock_folder
+from scenarios.result_folder import check_folder, disk_errors, lock_folder
 
 if TYPE_CHECKING:  # needs the extra `report`
     import pyarrow as pa
@@ -58,8 +58,7 @@ def opened(out: Path, card: Mapping[str, object]) -> Iterator[Store]:
         FleetError: the folder holds something else or another study, cannot be written, or another process writes it.
     """
     with disk_errors(out):
-        if out.exists() and not out.is_dir():
-            raise FleetError(f"Cannot write to '{out}': it is a file; --out needs a folder.")
+        check_folder(out)
         out.mkdir(parents=True, exist_ok=True)
     with lock_folder(out):
         with disk_errors(out):

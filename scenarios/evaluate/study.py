@@ -14,7 +14,7 @@ from fleet.errors import FleetError, nearest
 from fleet.seeding import child
 from scenarios.evaluate.rollout import FIGURES, DecisionLimit, Outcome, TooSlow
 from scenarios.evaluate.sources import ALL_SOURCES, check_source, drawn, is_trained, preparations
-from scenarios.policy_loader import Unusable, is_on_bus, label, policy_of, source_of, trainings_of
+from scenarios.policy_loader import is_on_bus, label, policy_of, source_of, trainings_of
 from scenarios.prepare.randomisation import Randomisation, randomisation_of
 from scenarios.run.log import code_hash, versions_of
 from scenarios.spec.load import INSTANCE, SPLITS, library, load
@@ -260,7 +260,7 @@ def split_source(name: str) -> tuple[str, str | None]:
 
 
 def check_policy(name: str, limit_s: float | None = None) -> None:
-    """Check that there is such a policy. One that is there and cannot be made fails later, shift by shift.
+    """Check that there is such a policy. One whose making raises an exception fails later, shift by shift.
 
     Args:
         limit_s: Most time until it is loaded and made, s.
@@ -274,8 +274,6 @@ def check_policy(name: str, limit_s: float | None = None) -> None:
             policy_of(name)
     except TooSlow as error:
         raise FleetError(f"The policy '{name}' takes longer than {limit_s:g} s to load (--decision-limit).") from error
-    except Unusable:
-        return
     except FleetError:
         raise
     except Exception:  # of its code

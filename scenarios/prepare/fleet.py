@@ -96,6 +96,8 @@ def prepare(
         MissingExtra: twins must be trained, and the libraries for it are not installed.
     """
     randomise = randomisation_of(randomise)
+    if not isinstance(training, int) or training < 0:
+        raise FleetError(f"training must be an integer >= 0 (got {training!r}).")
     check_progress(progress)
     specs = randomise.scenarios_of(scenario_with(scenario, {}, prepare))
     fleets: list[Fleet] = []

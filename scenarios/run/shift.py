@@ -17,13 +17,14 @@ from fleet.errors import FleetError, nearest
 from fleet.events import Event
 from fleet.observation import Observation
 from fleet.telemetry import Readings, Telemetry
-from scenarios.policy_loader import OnBus, blaming, check_name, policy_at
+from scenarios.policy_loader import OnBus, blaming, check_name, policy_at, scope_of
 from scenarios.prepare.fleet import Fleet, env_of, let_plan, prepare
 from scenarios.progress import Progress, quiet
 from scenarios.result_folder import new_folder
 from scenarios.run.log import RUN, RunLog, card_of, provenance
 from scenarios.run.metrics import HeatUse, metrics_of
 from scenarios.run.records import Offer, job_records, offers_of
+from scenarios.spec.load import keywords_of
 from scenarios.spec.options import RunSpec
 from scenarios.spec.schema import Scenario
 
@@ -62,12 +63,15 @@ def run(
             spec = RunSpec(**{"bus": "memory", **options})
         except TypeError as error:
             unknown = next((name for name in options if name not in RunSpec.__dataclass_fields__), "")
-            raise FleetError(
-                f"run() has no option '{unknown}'{nearest(unknown, RunSpec.__dataclass_fields__)}"
-            ) from error
+            allowed = [*RunSpec.__dataclass_fields__, *keywords_of(run)]
+            raise FleetError(f"run() has no option '{unknown}'{nearest(unknown, allowed)}") from error
+        except ValueError as error:
+            raise FleetError(str(error).removeprefix("RunSpec.")) from error
     elif options:
         raise FleetError(f"Give either a RunSpec or single options, not both (got {', '.join(options)}).")
     check_name(spec.policy)
+    with blaming(spec.policy, "loading"):  # before the fleet is prepared for minutes
+        scope_of(spec.policy)
     if not isinstance(fleet, Fleet):
         fleet = prepare(fleet, difficulty=spec.difficulty, risk=spec.risk, progress=progress)
     if out is not None:

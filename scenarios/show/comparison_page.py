@@ -204,9 +204,10 @@ def verdict(judged: Judged) -> list[str]:
         _against(other, values.difference(best, other), role, len(rest)) for other, role in _rivals(best, rest, base)
     ]
     sentences = [f"{label(best)} {'; it '.join(compared)}."] if compared else []
+    of_all = f"the best of {len(scores.policies)} policies, " if rest else ""
     whose = "Its mean score" if compared else f"The mean score of {label(best)}"
     sentences.append(
-        f"{whose} is {scores.policies[best].mean.text()}, the best of {len(scores.policies)} policies, where 0 is "
+        f"{whose} is {scores.policies[best].mean.text()}, {of_all}where 0 is "
         f"random and 1 the best schedule known for each of {scores.instances} instances."
     )
     sentences += _below({name: (each.difference, each.p_holm) for name, each in scores.policies.items()}, base)

@@ -1,6 +1,7 @@
 """Layout of a cell (reach, tasks that exclude each other, arms at work at once), and a scenario in words and tables."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import astuple, dataclass
 from itertools import combinations
 
@@ -10,14 +11,16 @@ from scipy.sparse import csr_array
 
 from fleet.arm.kinematics import REACH_M, SHOULDER_M
 from fleet.arm.space import SpaceTable
+from fleet.engine.world import warm_start
 from fleet.files import cache_folder
+from fleet.heat.thermal import WINDING
 from fleet.motion import Plan
 from fleet.robot import Robot
-from scenarios.prepare.arms import PlannedArm, plan_arms
-from scenarios.prepare.fleet import ShiftFactory, cell_problems, prepare, space_of
+from scenarios.prepare.arms import PlannedArm, air_offsets, plan_arms
+from scenarios.prepare.fleet import Fleet, ShiftFactory, cell_problems, prepare, space_of
 from scenarios.prepare.load_factor import LoadFactor, load_factor
 from scenarios.progress import Progress, quiet
-from scenarios.show.words import clock, duration
+from scenarios.show.words import clock, duration, names_text
 from scenarios.spec.calendar import begin_of, date_at
 from scenarios.spec.jobs import all_works, alternatives_of, fault_price, works_of
 from scenarios.spec.schema import ArmSpec, JobStream, Scenario
@@ -273,8 +276,26 @@ def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | str
         )
         if not any(work in arm.plans for work in works for arm in fleet.arms)
     ]
-    tail = "\n".join([*nobody, *refused[:MOST_REASONS], *more]) or "Every arm can do every job."
-    return [head, _arms(scenario), _jobs(scenario), tail]
+    tail = [*nobody, *refused[:MOST_REASONS], *more] or ["Every arm can do every job."]
+    return [head, _arms(scenario), _jobs(scenario), "\n".join([*tail, *_limits_passed_idle(fleet)])]
+
+
+def _limits_passed_idle(fleet: Fleet) -> Iterator[str]:
+    """A sentence for each limit that motors pass at home without work, when the cell is at its warmest."""
+    scenario, hottest = fleet.scenario, dict[str, float]()
+    horizon_s = scenario.horizon_s
+    times_s = np.clip([0.0, horizon_s, *(time_s for time_s, _ in scenario.ambient.points)], 0.0, horizon_s)
+    ambient_c = float(scenario.ambient.at(times_s).max())
+    for arm, offset_k in zip(fleet.arms, air_offsets(scenario), strict=True):
+        with suppress(ValueError):  # no steady state
+            hottest[arm.robot.name] = float(warm_start(arm, ambient_c + float(offset_k))[WINDING].max())
+    limits = scenario.limits
+    for name, low_c, high_c in (("warning", limits.warning_c, limits.error_c), ("error", limits.error_c, np.inf)):
+        if passed := [arm for arm, motor_c in hottest.items() if low_c <= motor_c < high_c]:
+            yield (
+                f"Without work, motors of {names_text(passed)} are above the {name} limit of {low_c:g} °C at "
+                f"{ambient_c:g} °C ambient temperature: up to {max(hottest[arm] for arm in passed):.1f} °C."
+            )
 
 
 def _fault_cost(scenario: Scenario) -> str:

@@ -603,7 +603,7 @@ def _award_section(log: ShiftLog) -> Iterator[Section]:
     )
     head = ("time", "job", "awarded to", "its offer", "other offers, the best first")
     shown = Table(head=head, rows=tuple(rows), numbers=False).html(key="choices", moments=moments)
-    details = ((f"The offers behind {len(awards)} awards", shown),)
+    details = ((f"The offers behind {len(awards)} award{'s' * (len(awards) > 1)}", shown),)
     yield Section(key="awards", title="Why each arm got its job", how=how, details=details)
 
 

@@ -8,7 +8,7 @@ arrivals of kind `weekly`. They become plain times here, so the rest of the prod
 import re
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, time, timedelta, tzinfo
-from math import ceil
+from math import ceil, inf
 from typing import Any
 from zoneinfo import ZoneInfo
 
@@ -72,7 +72,7 @@ def with_calendar(raw: Mapping[str, Any], begin: datetime | None, horizon_s: flo
     """
     made = dict(raw)
     if not horizon_s:
-        return made | ({"breaks": []} if "breaks" in made else {})
+        return made | {name: [] for name in ("breaks", "jobs") if name in made}
     if isinstance(breaks := raw.get("breaks"), list):
         made["breaks"] = [
             entry
@@ -209,6 +209,16 @@ def check_breaks(scenario: Scenario, file: str) -> None:
                 f"{file}: breaks[{i}]: '{each.name}', {own}, lies outside the shift, {shift}: change its times, or "
                 "leave it out."
             )
+    latest = dict[tuple[str, str], tuple[float, int]]()  # end and index, by name and arm
+    for i, each in sorted(enumerate(scenario.breaks), key=lambda one: one[1].begin_s):
+        for arm in each.arms or arms:
+            end_s, other = latest.get((each.name, arm), (-inf, i))
+            if each.begin_s < end_s:
+                raise ScenarioError(
+                    f"{file}: breaks[{i}].name: '{each.name}' is also the name of breaks[{other}], which overlaps it "
+                    f"on '{arm}': rename one, or leave it out."
+                )
+            latest[each.name, arm] = max((end_s, other), (each.end_s, i))
 
 
 def _span_text(scenario: Scenario, begin_s: float, end_s: float) -> str:

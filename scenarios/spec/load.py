@@ -60,6 +60,11 @@ def load(name_or_path: str | Path) -> Scenario:
     return parse_toml(content, path)
 
 
+def keywords_of(function: Callable[..., object]) -> list[str]:
+    """Names of the keyword-only parameters of a function."""
+    return [name for name, p in signature(function).parameters.items() if p.kind is Parameter.KEYWORD_ONLY]
+
+
 def scenario_with(
     scenario: str | Path | Scenario, overrides: Mapping[str, Any], function: Callable[..., object]
 ) -> Scenario:
@@ -75,11 +80,10 @@ def scenario_with(
         raise ScenarioError(f"scenario must be a library name, a .toml file or a Scenario (got {scenario!r}).")
     chosen = scenario if isinstance(scenario, Scenario) else load(scenario)
     fields = [field.name for field in dataclasses.fields(Scenario)]
-    options = [name for name, p in signature(function).parameters.items() if p.kind is Parameter.KEYWORD_ONLY]
     for name in overrides:
         if name == "seed":
             raise ScenarioError("make_env() takes no seed: give it to reset(seed=…).")
         if name not in fields:
-            allowed = nearest(name, [*fields, *options])
+            allowed = nearest(name, [*fields, *keywords_of(function)])
             raise ScenarioError(f"{chosen.name} with overrides: unknown key '{name}'{allowed}")
     return override(chosen, **overrides) if overrides else chosen

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from itertools import chain, combinations, pairwise
-from math import dist, inf, isfinite
+from math import dist, inf, isfinite, nan
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -209,13 +209,19 @@ def parse_scenario(raw: Mapping[str, object], path: Path) -> Scenario:
     return with_meshes(_with_traces(scenario, path), path)
 
 
+def _number(value: object) -> float:
+    """A value of a file; NaN if it is no number."""
+    return value if isinstance(value, int | float) else nan
+
+
 def _with_tables(raw: Mapping[str, object], path: Path) -> Mapping[str, object]:
     """The parsed file with times in seconds, a stream for each row of its job tables, and the begin as a text."""
     zone = zone_of(raw.get("time_zone"), f"{path.name}: time_zone")
     begin = shift_begin(raw.get("shift_begin"), f"{path.name}: shift_begin", zone)
-    places, horizon_s = raw.get("places"), raw.get("horizon_s")
+    places, horizon_s = raw.get("places"), _number(raw.get("horizon_s"))
+    least_s = _number(raw.get("decision_interval_s", Scenario.decision_interval_s))
     # Their own faults are reported when the scenario is made.
-    horizon_s = float(horizon_s) if isinstance(horizon_s, int | float) and 0 < horizon_s < MOST_S else 0.0
+    horizon_s = float(horizon_s) if 0 < horizon_s < MOST_S and least_s <= horizon_s else 0.0
     raw = with_calendar(raw, begin, horizon_s, path.name) | {"shift_begin": begin and begin.isoformat()}
     jobs = raw.get("jobs")
     if not isinstance(jobs, list) or not any(isinstance(each, Mapping) and "table" in each for each in jobs):

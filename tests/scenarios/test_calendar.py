@@ -140,6 +140,14 @@ BREAK = {"name": "lunch", "begin": "4:00", "end": "5:00"}
             "4:00 to 5:00 is outside the shift, which begins at 06:00 and ends 12 h later",
         ),
         ({"breaks": [BREAK], "horizon_s": 0}, "horizon_s must be"),
+        (
+            {"breaks": [BREAK], "shift_begin": "2026-11-23T06:00Z", "horizon_s": 2},
+            r"decision_interval_s must not exceed horizon_s \(got 10.0, 2.0\); is horizon_s in hours\?",
+        ),
+        (
+            {"breaks": [BREAK, BREAK | {"begin": "4:30", "arms": ["left"]}]},
+            r"breaks\[1\].name: 'lunch' is also the name of breaks\[0\], which overlaps it on 'left': rename one",
+        ),
         ({"breaks": [BREAK | {"begin": "11.30"}]}, r"breaks\[0\]: is this 11:30\? Give times as h:mm"),
         (
             {"breaks": [BREAK | {"begin": "11:30", "end": "11:00"}], "shift_begin": "2026-11-23T06:00Z"},

@@ -123,6 +123,17 @@ def test_show_fits_eighty_columns_and_cuts_no_word(thermofleet, small_toml):
     assert "due after 30 min; Poisson" in said.out
     assert "thermal load factor" in said.out
     assert json.loads(thermofleet("show", small_toml, "--json").out)["name"] == "heat"
+    assert "Without work" not in said.out
+    for limits, sentence in (
+        (
+            "restart_c = 20\nwarning_c = 30",
+            "Without work, motors of left and right are above the warning limit of 30 °C at",
+        ),
+        ("restart_c = 20\nwarning_c = 25\nerror_c = 30", "above the error limit of 30 °C at"),
+    ):
+        low = small_toml.with_name("low.toml")
+        low.write_text(f"{small_toml.read_text()}\n[limits]\n{limits}\n")
+        assert sentence in " ".join(thermofleet("show", low).out.split())
 
 
 def test_compare_prints_a_table_or_json_against_round_robin_or_the_first_policy(thermofleet, small_toml, monkeypatch):
@@ -169,6 +180,7 @@ BAD_INPUT: list[tuple[str, Callable[[str], str] | None, list[str], str]] = [
     ("seed text", None, ["--seed", "one"], "parse string as an integer (got 'one'). See"),
     ("option", None, ["--sed", "1"], "No such option: --sed"),
     ("out is a file", None, ["--out", "HERE/heat.toml"], "it is a file; --out needs a folder."),
+    ("out is no table", None, ["--out", "HERE/run.pdf"], "--out must be a folder, without the ending of a file (got '"),
     ("out below a file", None, ["--out", "HERE/heat.toml/run"], "heat.toml' is a file, not a folder."),
     ("out is taken", None, ["--out", "HERE"], "holds other files ('heat.toml'); --out needs a new folder"),
 ]
@@ -203,6 +215,11 @@ WRONG_WORDS = {
     "show quickstart --hold 1": "--hold takes no scenario; leave 'quickstart' out.",
     "compare quickstart --policies random,rnd": "No policy 'rnd'; did you mean 'random'?",
     "compare quickstart --baseline best": "The baseline 'best' is not among the policies compared: ",
+    "compare quickstart --out x.pdf": "without the ending of a file, or a file that ends in .csv, .xlsx (got '",
+    "up quickstart --out x.pdf": "--out must be a folder, without the ending of a file (got 'x.pdf').",
+    "bus record quickstart --out x.pdf": "--out must be a folder, without the ending of a file (got 'x.pdf').",
+    "train quickstart --out x.pdf": "--out must be a folder, without the ending of a file (got 'x.pdf').",
+    "twin identify --log x.csv --out x.pdf": "--out must be a folder, without the ending of a file (got 'x.pdf').",
     "show --hold 1 --posture hom": "No posture 'hom'; did you mean 'home'?",
     "run heat.toml --topology rign": "Error: No topology 'rign'; did you mean 'ring'?",
     "compare heat.toml --partition soon": "Error: --partition needs FROM_S:TO_S:ARM,ARM|ARM,ARM",

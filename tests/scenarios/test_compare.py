@@ -89,7 +89,7 @@ def test_figures_are_means_over_seeds_with_intervals_around_them(scenario, plans
     ("changes", "sentence"),
     [
         ({"policies": ("rnd", "round_robin")}, "No policy 'rnd'; did you mean 'random'?"),
-        ({"policies": ()}, "A comparison needs a policy and a seed (got 0 policies, 3 seeds)."),
+        ({"policies": ()}, "A comparison needs a policy and a seed (got policies: 0, seeds: 3)."),
         ({"policies": ("random", "random")}, "The policy 'random' is given twice"),
         ({"baseline": "coolest_first"}, "The baseline 'coolest_first' is not among the policies compared: random, "),
     ],
@@ -333,6 +333,7 @@ def test_a_comparison_is_one_table_in_every_form(study: Study):
     assert f"| wsept | {figure.mean:.1f} |" in markdown
     assert f"reward,wsept,{figure.mean:.1f}," in lines
     assert result._repr_html_() == html
+    assert replace(result, seeds=(7,)).title.startswith(f"{result.scenario}, seed 7 (")
 
 
 def test_an_exported_figure_is_a_number_and_a_name_is_no_formula(study: Study):
@@ -346,6 +347,20 @@ def test_an_exported_figure_is_a_number_and_a_name_is_no_formula(study: Study):
     assert mean == pytest.approx(result.figures["wsept"]["reward"].mean, rel=1e-5)
     assert (rows[-1][0].value, rows[-1][0].data_type) == ("=1+1", "s")
     assert table.content(".csv").decode().count("\n") == 1 + len(table.rows)
+
+
+def test_an_export_has_the_normalised_scores_of_the_page(study: Study):
+    of_all = judged(study, rows_of(study), KNOWN_SHIFTS)
+    assert of_all.scores is not None
+    table = figures_table(of_all.results, of_all.scores)
+    score = of_all.scores.policies["wsept"]
+    (row,) = (row for row in table.rows if row[1:3] == ("normalised score", "wsept"))
+    assert [float(cell) for cell in row[4:8]] == pytest.approx(
+        [score.mean.mean, score.mean.low, score.mean.high, score.difference.mean], rel=1e-5
+    )
+    assert row[0] == of_all.results[0].scenario
+    twice = figures_table([*of_all.results] * 2, of_all.scores).rows
+    assert {row[0] for row in twice if row[1].startswith("normalised score")} == {"all"}
 
 
 def test_only_texts_that_a_spreadsheet_would_compute_get_an_apostrophe():

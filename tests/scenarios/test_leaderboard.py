@@ -128,10 +128,10 @@ FORGED = {
     "a shift is missing": (cut(0, -1), "1 of 200 shifts are missing, the first test/0199, training 0"),
     "a shift is given twice": (
         lambda given: msgspec.structs.replace(given, rows=(*given.rows, given.rows[0])),
-        "1 shifts are given twice",
+        "shifts given twice: 1",
     ),
     "a training is missing": (changed(None, trainings=2), "200 of 400 shifts are missing"),
-    "a shift of another split": (changed(3, instance="train/0003"), "1 shifts are not of the split test"),
+    "a shift of another split": (changed(3, instance="train/0003"), "shifts not of the split test: 1,"),
     "another scenario": (changed(3, scenario="0" * 16), "test/0003 was another scenario"),
     "another seed": (changed(3, seed=1), "test/0003 has seed"),
     "another manifest": (changed(None, manifest="0" * 16), "manifest of the split test is another one"),

@@ -473,12 +473,11 @@ def test_submitted_jobs_survive_a_kill(endpoint, tmp_path, thermofleet):
         assert code == 1
         assert out.startswith("a: accepted\nb: refused: No place 'moon' in this cell. Places: ")
         table = tmp_path / "jobs.csv"
-        table.write_text("name,kind,places,after,payload\nc,hold,moon,,\nd,hold,belt,,heavy\ne,hold,mars,,\n")
+        table.write_text("name,kind,places,after,payload\nc,hold,moon,,\ne,hold,mars,,\n")
         code, out, err = thermofleet("job", "submit", table, *at)
         assert (code, out) == (2, "")
-        assert f"{table} has 3 faults:\n  row 2, column places: no place 'moon'. Allowed: " in err
-        assert "row 3, column payload: expected a number (got 'heavy')." in err
-        assert "row 4, column places: no place 'mars'" in err
+        assert f"{table} has 2 faults:\n  row 2, column places: no place 'moon'. Allowed: " in err
+        assert "row 3, column places: no place 'mars'" in err
         table.write_text("name,kind,places,after\na,hold,belt,\nd,hold,belt,\ne,hold,belt,no/one\n")
         code, out, _ = thermofleet("job", "submit", table, *at)
         assert (code, out.splitlines()) == (1, [
@@ -548,6 +547,14 @@ def test_an_invalid_job_is_reported_with_its_line(tmp_path, text, complaint):
         read_jobs(str(file))
     assert str(refusal.value).startswith(f"{file}")
     assert complaint in str(refusal.value)
+
+
+def test_faults_of_a_table_are_told_before_a_fleet_is_asked_for_its_places(tmp_path, thermofleet, monkeypatch):
+    monkeypatch.delattr("scenarios.live.requests.BusClient")
+    table = tmp_path / "jobs.csv"
+    table.write_text("name,kind,places,payload\nd,hold,moon,heavy\n")
+    code, _, err = thermofleet("job", "submit", table, "--fleet", "f")
+    assert (code, "row 2, column payload: expected a number (got 'heavy')." in err) == (2, True)
 
 
 def test_jobs_in_several_messages_follow_those_they_wait_for():

@@ -51,8 +51,6 @@ def test_a_shift_and_a_comparison_from_the_file_of_a_scenario(small_toml, plans,
     result = tf.compare(small_toml, ["round_robin", "wspt"], seeds=range(2), difficulty="blind", workers=1)
     assert result.baseline == "round_robin"
     assert "wspt" in result.table.markdown()
-    with pytest.raises(Exception, match=r"run\(\) has no option 'polcy'; did you mean 'policy'\?"):
-        tf.run(small_toml, polcy="wspt")
 
 
 class Mine:
@@ -65,6 +63,7 @@ class Mine:
         ({"policies": "wsept"}, r"policies must be a list of names, .* \(got 'wsept'\)"),
         ({"policies": ["wsept", Mine]}, r"A policy is given by name: .*'mine.py:Mine' for a class in a file \(got"),
         ({"policies": ["wsept"], "seeds": [0, 1, 0]}, "Seed 0 is given twice"),
+        ({"policies": ["wsept"], "seeds": [1.5]}, r"seed must be an integer >= 0 \(got 1.5\)"),
         ({"policies": ["wsept"], "seeds": 3}, r"seeds must be a list of integers, for example range\(3\) \(got 3\)"),
     ],
 )
@@ -73,9 +72,32 @@ def test_arguments_of_a_comparison_are_checked(arguments, says):
         tf.compare("quickstart", **arguments)
 
 
-def test_a_shift_takes_the_name_of_a_policy():
-    with pytest.raises(FleetError, match="A policy is given by name"):
-        tf.run("quickstart", policy=Mine)
+def test_arguments_of_a_shift_are_checked():
+    for options, says in (
+        ({"policy": Mine}, "A policy is given by name"),
+        ({"seed": 1.5}, r"^seed must be an integer \(got 1.5\)"),
+        ({"polcy": "wspt"}, r"run\(\) has no option 'polcy'; did you mean 'policy'\? Allowed: bus, .* out, "),
+    ):
+        with pytest.raises(FleetError, match=says):
+            tf.run("quickstart", **options)
+    with pytest.raises(FleetError, match=r"training must be an integer >= 0 \(got 1.5\)"):
+        tf.prepare("quickstart", training=1.5)
+
+
+def test_a_policy_that_needs_arguments_is_refused_before_a_preparation(tmp_path, monkeypatch):
+    monkeypatch.delattr("scenarios.run.shift.prepare")
+    own = tmp_path / "mine.py"
+    own.write_text("from agents.rules import RoundRobin\nclass Mine(RoundRobin):\n def __init__(self, gain): ...\n")
+    says = "missing a required argument: 'gain'.*: give its parameters defaults"
+    with pytest.raises(FleetError, match=says):
+        tf.run("quickstart", policy=f"{own}:Mine")
+    with pytest.raises(FleetError, match=says):
+        tf.compare("quickstart", [f"{own}:Mine"], workers=1)
+
+
+def test_an_allowed_name_is_listed_once():
+    with pytest.raises(FleetError, match="Allowed: ambient, arms, bids, breaks, bus, cache, "):
+        tf.make_env("quickstart", slot=3)
 
 
 def test_a_table_is_printed_as_the_command_prints_it():

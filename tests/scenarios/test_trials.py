@@ -39,8 +39,6 @@ class Raises(Idle):
         return seen["nobody"] if self.asked == 4 else {}
 class Nonsense(Idle):
     def act(self, seen): return dict.fromkeys(seen, "wait")
-class Needs(Idle):
-    def __init__(self, weight): pass
 class Stuck(Idle):
     def act(self, seen):
         while True:
@@ -163,7 +161,7 @@ def test_a_folder_of_something_else_is_refused(scenario, plans, tmp_path, bad):
 
 @pytest.mark.ci_slow
 def test_policies_that_fail_are_told_and_the_others_go_on(scenario, plans, bad, tmp_path):
-    names = {name: f"{bad}:{name}" for name in ("Raises", "Nonsense", "Needs", "Stuck", "Illegal", "Idle")}
+    names = {name: f"{bad}:{name}" for name in ("Raises", "Nonsense", "Stuck", "Illegal", "Idle")}
     study = study_of(scenario, "round_robin", *names.values(), seeds=2, decision_limit_s=2.5)
     rows = runner.run_study(study, out=tmp_path / "out", cache_dir=plans, workers=1)
     by_policy = {policy: [row for row in rows if row.key.policy == policy] for policy in study.policies}
@@ -172,7 +170,6 @@ def test_policies_that_fail_are_told_and_the_others_go_on(scenario, plans, bad, 
     said = {
         "Raises": ("KeyError: 'nobody' (at 30 s of the shift)", 'return seen["nobody"]'),
         "Nonsense": ("ValueError: The action of 'left' must be one integer (got 'wait').", "validation.py"),
-        "Needs": ("must be a class or function that is called without arguments", "policy_loader.py"),
         "Stuck": ("TooSlow: a decision took longer than 2.5 s", "while True: pass"),
     }
     for name, (error, trace) in said.items():

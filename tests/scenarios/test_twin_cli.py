@@ -90,14 +90,22 @@ def test_training_again_gives_the_same_twin_and_tells_its_quality(thermofleet, l
     assert all(fit["mean_squared_error"] > 0 for fit in told["twins"][0]["networks"])
 
 
-def test_ctrl_c_while_learning_a_log_promises_nothing(thermofleet, logs, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("step", "stage"),
+    [
+        ("twin.logs.reader.read_folder", "reading the log"),
+        ("twin.vae.train.train", "learning the log"),
+        ("scenarios.prepare.twins.save", "writing"),
+    ],
+)
+def test_ctrl_c_while_a_twin_of_a_log_is_made_promises_nothing(thermofleet, logs, tmp_path, monkeypatch, step, stage):
     def interrupted(*_args, **_more):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("twin.vae.train.train", interrupted)
+    monkeypatch.setattr(step, interrupted)
     said = thermofleet("twin", "train", "--log", logs / "cool", *TINY, "--out", tmp_path / "twins")
     assert said.code == 130
-    assert said.err.splitlines()[-1] == "Interrupted while learning the log: nothing was written."
+    assert said.err.splitlines()[-1] == f"Interrupted while {stage}: nothing was written."
     assert not (tmp_path / "twins").exists()
 
 

@@ -130,6 +130,8 @@ def test_two_shifts_play_in_step(browser: Browser, run: RunLog, tmp_path: Path, 
     assert len(boxes) == 2
     side_by_side = boxes[0]["y"] == boxes[1]["y"]  # pyright: ignore[reportOptionalSubscript]
     assert side_by_side == (width > 800)
+    for box, scale in zip(boxes, page.locator(".cell .scale").all(), strict=True):
+        assert scale.bounding_box()["y"] >= box["y"] + box["height"]  # pyright: ignore[reportOptionalSubscript]
     assert page.locator("html").evaluate("e => e.scrollWidth - e.clientWidth") <= 0
     page.close()
 

@@ -6,6 +6,7 @@ import logging
 import os
 import re
 import zlib
+from array import array
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -192,7 +193,7 @@ def _rows(lines: Sequence[str], columns: _Columns, *, first: int) -> tuple[Array
     Args:
         first: Number of the first line in the file.
     """
-    rows: list[list[float]] = []
+    numbers = array("d")  # a fifth of the memory of lists
     where: list[int] = []
     damage: list[Damage] = []
     for line, raw in enumerate(lines, start=first):
@@ -201,11 +202,11 @@ def _rows(lines: Sequence[str], columns: _Columns, *, first: int) -> tuple[Array
         try:
             if "\0" in raw:
                 raise ValueError(_NUL_BYTES)
-            rows.append(_numbers(raw, columns.names, columns.separator))
+            numbers.extend(_numbers(raw, columns.names, columns.separator))
             where.append(line)
         except ValueError as error:
             damage.append(Damage(line, str(error)))
-    values = np.array(rows, dtype=float).reshape(-1, len(columns.names))
+    values = np.array(numbers).reshape(-1, len(columns.names))
     named = columns.named
     kept = [i for i, name in enumerate(columns.names) if name in named]
     return values[:, kept], np.array(where, dtype=int), damage
@@ -236,15 +237,19 @@ def _header(path: Path, line: int, text: str) -> _Columns:
 
 
 def _numbers(line: str, names: Sequence[str], separator: str) -> list[float]:
-    """The numbers of a line, 0 in columns without a name; a date is in seconds since 1970.
+    """The numbers of a line, any in columns without a name; a date is in seconds since 1970.
 
     Raises:
         ValueError: the line has no such numbers; the reason.
     """
     cells = line.replace('"', "").split(separator)
     if len(cells) != len(names):
-        raise ValueError(f"{len(cells)} fields where the header has {len(names)}")
-    numbers: list[float] = []
+        raise ValueError(f"{len(cells)} field{'s' * (len(cells) > 1)} where the header has {len(names)}")
+    with suppress(ValueError):
+        numbers = list(map(float, cells))
+        if all(map(isfinite, numbers)):
+            return numbers
+    numbers = list[float]()  # cell by cell: a date, a text without a name, or what is wrong
     for column, (cell, name) in enumerate(zip(cells, names, strict=True), start=1):
         try:
             numbers.append(float(cell) if name else 0.0)

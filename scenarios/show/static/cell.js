@@ -11,6 +11,8 @@ function drawnBySoftware() {
 
 const STANDING_M = 0.7, MARGIN_M = 0.15; // length of an arm along its mount in most postures; room round it
 
+const SCALE_PX = 44; // height of the strip with the scale, below the picture: names of arms cannot cover it
+
 // The colour scale of the motors, with its limits.
 function makeScale({ colours, marks_c, warning_c, error_c }) {
   const bar = document.createElement("div"), first = marks_c[0], all = marks_c[marks_c.length - 1] - first;
@@ -286,7 +288,7 @@ function makeCell(place, model) {
     event.stopPropagation();
   });
   new ResizeObserver(() => {
-    const [width, height] = [place.clientWidth || 300, place.clientHeight || 300];
+    const [width, height] = [place.clientWidth || 300, (place.clientHeight || 300) - SCALE_PX];
     renderer.setPixelRatio(Math.min(2, devicePixelRatio));
     renderer.setSize(width, height);
     camera.aspect = width / height;
