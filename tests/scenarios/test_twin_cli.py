@@ -269,7 +269,11 @@ def test_a_forecast_follows_from_a_log_and_a_plan(thermofleet, small_toml, tmp_p
     assert [limit["limit_c"] for limit in card["limits"]] == [40.0, 60.0, 75.0]
     assert len(card["time_s"]) == len(card["median_c"]) == len(card["low_c"])
     assert card["run_s"] == pytest.approx(39.5)
+    assert max(card["residual_k"]) < 0.5
+    assert "Do not trust" not in said.out
+    assert re.search(r"The plan ends \d\.\d\d rad from where it begins", said.out)
     of_job = thermofleet("twin", "forecast", "--log", log, "--plan", f"{small_toml}/hold", "--repeat", 3)
+    assert "The plan ends" not in of_job.out
     assert of_job.code == 0, of_job.err
     assert re.search(r"/hold by left: hold [\d.]+ kg at bench", of_job.out), of_job.out
     for word, sentence in (
