@@ -141,6 +141,7 @@ def _unit_of_times(times_s: Sequence[float], horizon_s: float) -> str:
     middle = sorted(times_s)[len(times_s) // 2]  # a single date beyond the shift is no unit
     if middle >= horizon_s and last / 1000 < horizon_s and last >= 10 * horizon_s:
         return f" Are these milliseconds? {last:g} ms is {last / 1000:g} s. Give seconds."
-    if len(times_s) >= FEW and horizon_s / 2 <= 60 * last <= horizon_s:
-        return f" Are these minutes? {last:g} min is {60 * last:g} s. Give seconds."
+    for unit, short, unit_s in (("minutes", "min", 60), ("hours", "h", 3600), ("days", "d", 86_400)):
+        if len(set(times_s)) >= FEW and horizon_s / 2 <= unit_s * last <= horizon_s:
+            return f" Are these {unit}? {last:g} {short} is {unit_s * last:g} s. Give seconds."
     return ""

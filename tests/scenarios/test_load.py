@@ -331,6 +331,8 @@ def test_the_warning_counts_the_times_that_lie_outside(tmp_path_factory, inside,
 
 
 def test_a_trace_in_minutes_or_partly_in_milliseconds_is_asked_about(tmp_path, caplog):
+    with_trace(tmp_path, b"0\n0.5\n1.9\n")
+    assert "Are these hours? 1.9 h is 6840 s. Give seconds." in caplog.text
     with_trace(tmp_path, b"0\n60\n118\n")
     assert "all 3 times are within 118 s of a shift of 7200 s. Are these minutes? 118 min is 7080 s." in caplog.text
     with_trace(tmp_path, b"0\n60000\n118000\n")
