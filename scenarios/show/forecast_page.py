@@ -36,7 +36,11 @@ def summary(found: ThermalForecast, so_far: Recording, repetitions: int) -> list
     )
     if math.isinf(warmer_k):
         at = f"from an arm at {found.ambient_c:g} °C"
-        return [*doubts, first, f"No start is safe: P({warning_c:g} °C) is more than {100 * RISK:g} % even {at}."]
+        return [
+            *doubts,
+            first,
+            f"No start of the planned run is safe: P({warning_c:g} °C) is more than {100 * RISK:g} % even {at}.",
+        ]
     # Rounded down, so that it is below the limit.
     start_c = math.floor(10.0 * (float(so_far_c(so_far).max()) + warmer_k) - 1e-6) / 10.0
     than = f"{abs(warmer_k):.1f} K {'warmer' if warmer_k >= 0 else 'cooler'} than now"
