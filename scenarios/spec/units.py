@@ -37,7 +37,12 @@ _MISTAKES: Mapping[str, _Mistake] = {
     "clearance_m": _Mistake("millimetres", 0.5, 20_000.0),
 }
 """By key, at any depth of a file."""
+_FAHRENHEIT: Mapping[str, _Mistake] = {
+    **dict.fromkeys(("warning_c", "error_c", "restart_c"), _Mistake("°F", 110.0, 263.0)),
+}
+"""Of limits of motors, which stop at 75 °C."""
 _MEANT: Mapping[str, Callable[[float], str]] = {
+    "°F": lambda f: f"{f:g} °F is {(f - 32) / 1.8:.1f} °C. Give °C.",
     "kelvin": lambda k: f"{k:g} K is {k - 273.15:.1f} °C. Give °C.",
     "grams": lambda g: f"{g:g} g is {g / 1000:g} kg. Give kg.",
     "millimetres": lambda mm: f"{mm:g} mm is {mm / 1000:g} m. Give m.",
@@ -67,10 +72,11 @@ def question(key: str, numbers: Sequence[float]) -> str:
         turns = [abs(each) for each in numbers if abs(each) in _TURNS]
         if turns and all(not each or abs(each) in _TURNS for each in numbers):
             return f"is this radians? {turns[0]:g} rad is {degrees(turns[0]):.0f}°. Give degrees."
-    mistake, worst = _MISTAKES.get(key), max(numbers, key=abs)
-    if mistake is None or not mistake.low <= abs(worst) <= mistake.high:
-        return ""
-    return f"is this {mistake.unit}? {_MEANT[mistake.unit](worst)}"
+    worst = max(numbers, key=abs)
+    for mistakes in (_MISTAKES, _FAHRENHEIT):
+        if (mistake := mistakes.get(key)) and mistake.low <= abs(worst) <= mistake.high:
+            return f"is this {mistake.unit}? {_MEANT[mistake.unit](worst)}"
+    return ""
 
 
 def _numbers(raw: object, place: str = "", key: str = "") -> Iterator[tuple[str, str, list[float]]]:
@@ -123,6 +129,12 @@ def check_times(times_s: Sequence[float], horizon_s: float, where: str, names: S
         )
     elif question:
         _LOG.warning("%s: all %d times are within %g s of a shift of %g s.%s", where, count, last, horizon_s, question)
+
+
+def check_ambient(times_s: Sequence[float], horizon_s: float, where: str) -> None:
+    """Log a warning if the times of ambient temperatures are probably in another unit; `where` begins it."""
+    if times_s and (asked := _unit_of_times(times_s, horizon_s)):
+        _LOG.warning("%s: the last time is %g.%s", where, max(times_s), asked)
 
 
 def _first_outside(times_s: Sequence[float], horizon_s: float, names: Sequence[str]) -> str:
