@@ -235,7 +235,7 @@ def judge_plan(time_s: Array, readings: Mapping[str, Array], *, degrees: bool) -
     if not len(time_s):
         return []
     bad = [*judge_time(time_s), *_out_of_range(readings, degrees)]
-    if not bad and len(time_s) >= LEAST_ROWS:
+    if not bad and len(time_s) >= LEAST_ROWS and readings["qd"].any():  # else the speeds are those of the angles
         bad += _motion(time_s, readings, degrees)
     return bad or unheld(readings)
 

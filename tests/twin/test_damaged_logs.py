@@ -540,11 +540,13 @@ def test_a_plan_in_other_units_is_refused(name: str, tmp_path: Path) -> None:
     plan = {"time_s": time_s, "q": q, "qd": 0.08 * np.cos(angle), "tau": gravity_terms(q)[:, :, 2]}
     head = ",".join(["time_s", *(f"{name}_{j}" for name in ("q", "qd", "tau") for j in range(1, 8))])
     path, (change, question) = tmp_path / "plan.csv", PLANS[name]
-    for sound_plan in (True, False):
+    for sound_plan, factor in ((True, 0.0), (True, 1.0), (False, 1.0)):
+        plan["qd"] = factor * 0.08 * np.cos(angle)  # all zero: not given
+        if not sound_plan:
+            change(plan)
         rows = np.column_stack(list(plan.values())).tolist()
         path.write_text("\n".join([head, *(",".join(map(repr, row)) for row in rows), ""]), encoding="utf-8")
         if sound_plan:
             assert len(read(path, measured=False)[0].time_s) == len(time_s)
-            change(plan)
     with pytest.raises(LogError, match=question):
         read(path, measured=False)
