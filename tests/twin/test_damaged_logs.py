@@ -25,8 +25,8 @@ from fleet.readings import (
     possible_temperatures,
 )
 from fleet.robot import Robot
-from twin.logs.reader import read
-from twin.logs.recording import READINGS, stretches
+from twin.logs.reader import of_arm, read
+from twin.logs.recording import READINGS, Recording, stretches
 
 ARM = ArmModel(Robot(name="logged"))
 TORQUE_PER_AMP = np.array([10.2] * 4 + [6.6] * 3)
@@ -505,6 +505,19 @@ def test_a_log_and_a_plan_of_one_arm_have_one_mount(sign: float) -> None:
         q = start + 0.3 * np.sin(np.linspace(0.0, 5.0, 50))[:, None]
         parts.append({"q": q, "qd": 0.0 * q, "tau": factor * gravity_terms(q)[:, :, 2]})
     assert mounts_differ(*parts) == (sign < 0)
+
+
+def test_a_log_with_the_other_sign_among_those_of_one_arm_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    logs = list[Recording]()
+    for seed, sign in enumerate((1.0, -1.0, 1.0)):
+        q = START + 0.4 * np.random.default_rng(seed).standard_normal((50, 7))
+        tau = sign * gravity_terms(q)[:, :, 2]
+        logs.append(Recording(name=f"day {seed}", time_s=np.arange(50.0), q=q, qd=0.0 * q, tau=tau))
+    assert of_arm(logs, None, Path("logs")) == logs
+    assert "logs: no mount of one arm explains the torques of all its 3 logs. Without 'day 1', one does." in caplog.text
+    caplog.clear()
+    of_arm(logs[::2], None, Path("logs"))
+    assert not caplog.text
 
 
 def test_a_planned_motion_has_no_sensors(tmp_path: Path) -> None:

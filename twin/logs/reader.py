@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 
 from fleet.errors import LogError, nearest
 from fleet.files import decode_text
-from fleet.readings import clock_step, judge, judge_plan, repeats
+from fleet.readings import clock_step, judge, judge_plan, mounts_differ, repeats
 from fleet.robot import JOINTS
 from twin.logs.recording import GAP_S, READINGS, Recording
 
@@ -580,11 +580,24 @@ def of_arm(recordings: Sequence[Recording], arm: str | None, path: Path) -> list
     names = dict.fromkeys(each.name.rpartition("/")[2] for each in recordings if "/" in each.name)
     if arm is None and len(names) > 1:
         raise LogError(str(path), None, f"holds several arms: choose one with --arm ({', '.join(names)}).")
-    if arm is None or not names:
-        return list(recordings)
-    if arm not in names:
+    if arm is not None and names and arm not in names:
         raise LogError(str(path), None, f"has no arm '{arm}'{nearest(arm, names)}")
-    return [each for each in recordings if each.name.rpartition("/")[2] == arm]
+    own = [each for each in recordings if arm is None or not names or each.name.rpartition("/")[2] == arm]
+    _warn_of_mounts(path, own)
+    return own
+
+
+def _warn_of_mounts(where: Path, recordings: Sequence[Recording]) -> None:
+    """Log if no mount explains the torques of all logs, and the log without which one does."""
+    logs = [vars(each) for each in recordings]
+    if len(logs) > 1 and mounts_differ(*logs):
+        odd = next((i for i in range(len(logs)) if not mounts_differ(*logs[:i], *logs[i + 1 :])), None)
+        but = "" if odd is None or len(logs) == 2 else f" Without '{recordings[odd].name}', one does."
+        log.warning(
+            "%s: no mount of one arm explains the torques of all its %d logs.%s Has one of them torques of the other "
+            "sign, or is it of another arm? Leave it out.",
+            *(where, len(logs), but),
+        )
 
 
 def _name(path: Path) -> str:
