@@ -30,6 +30,8 @@ TORQUE_NM = 2 * np.array([105.0] * 4 + [52.0] * 3)
 """Twice the hard safety limit of the torque."""
 TEMP_RANGE_C = (-40.0, 200.0)
 """Range of a motor's temperature sensor."""
+RARE = 0.05
+"""Share of rows beyond these, from which the unit is wrong: without those rows, only the light load would be left."""
 COOL_C, HOT_C = 65.0, ThermalLimits().error_c + 10.0
 """Upper limits of median temperatures over a log, °C: of the coolest motor (an idle wrist has 45), and of any motor (it
 stops at 75)."""
@@ -304,7 +306,7 @@ def _out_of_range(readings: Mapping[str, Array], degrees: bool) -> Iterator[BadR
     ):
         if channel in readings:
             what = f"more than a Gen3 has ({_NAMES[channel]})"
-            yield from _limited(readings[channel], limit, readings[channel], unit, what, guess)
+            yield from _limited(readings[channel], limit, readings[channel], unit, what, guess, RARE)
     if "temp_c" in readings:
         temp_c = readings["temp_c"]
         middle_c, half_k = np.mean(TEMP_RANGE_C), np.ptp(TEMP_RANGE_C) / 2
@@ -324,14 +326,14 @@ _NAMES = {"q": "angle", "qd": "velocity", "tau": "torque", "current_a": "current
 
 
 def _limited(
-    values: Array, most: Array | float, shown: Array, unit: str, what: str, remedy: str
+    values: Array, most: Array | float, shown: Array, unit: str, what: str, remedy: str, share: float = 0.5
 ) -> Iterator[BadReading]:
     outside = np.abs(values) > most
     rows = np.flatnonzero(outside.any(axis=1))
     for row in rows:
         joint = int(outside[row].argmax())
         found = f"joint {joint + 1} at {shown[row, joint]:.5g}{unit} is {what}"
-        yield BadReading(found, remedy, np.array([row]), 2 * len(rows) > len(values))
+        yield BadReading(found, remedy, np.array([row]), len(rows) > share * len(values))
 
 
 def _unit_of(temp_c: Array) -> str:

@@ -166,6 +166,10 @@ WHOLE = {
     "tenths": (changed("Temp", lambda v: np.round(v * 10)), r"tenths of °C \(then 3"),
     "thousandths": (changed("Temp", lambda v: np.round(v * 1000)), r"thousandths of °C \(then 3"),
     "mA": (changed("Current", lambda v: v * 1000), "Are these mA"),
+    "current in percent": (
+        changed("Current", lambda v: v * 10),
+        "is more than a Gen3 has .current.*Are these mA",
+    ),
     "currents of another motor": (changed("Current", lambda v: v * 7), "current and torque of joint 2 disagree"),
     "N·mm": (changed("Torque", lambda v: v * 1000), "Are these N·mm"),
     "joints 2 and 4 swapped": (reordered(SWAP, *CHANNELS), "joints 2 and 4 swapped it would be"),
