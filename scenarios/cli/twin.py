@@ -83,14 +83,9 @@ def identify_command(
     say("Nothing was written; --out FOLDER keeps it." if out is None else f"Written to {out}.", out_console)
 
 
-MOST_SD = 4.0
-"""Usual distance of an arm from a nominal Gen3, in standard deviations of arms: 3 in public logs, 7.5 with currents
-three times as large."""
-
-
 def doubts_of(network: "Identified") -> list[str]:
     """What speaks against an identified network, in sentences."""
-    from twin.thermal.forecast import MOST_RESIDUAL_K
+    from twin.thermal.forecast import MOST_RESIDUAL_K, MOST_SD
 
     doubts, worst_k = list[str](), max(map(max, network.rms_k.values()))
     far, sd = max(
@@ -100,7 +95,7 @@ def doubts_of(network: "Identified") -> list[str]:
         of = "" if far.joint is None else f" of joint {far.joint}"
         doubts.append(f"{far.name}{of} is {far.value / far.prior:.2g} times that of a nominal Gen3")
     if worst_k > MOST_RESIDUAL_K:
-        doubts.append(f"a residual of {worst_k:.1f} K, where public logs have up to 0.2 K")
+        doubts.append(f"a residual of {worst_k:.1f} K, where public logs have up to 0.3 K")
     ask = "Check the units and the order of temperatures, currents and torques."
     return [f"Do not trust this network: {', and '.join(doubts)}. {ask}"] if doubts else []
 

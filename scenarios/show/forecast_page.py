@@ -12,7 +12,7 @@ from scenarios.show.page import Chart, Page, Section, origin_table
 from scenarios.show.words import duration
 from scenarios.table import Column, Table
 from twin.logs.recording import Recording
-from twin.thermal.forecast import MOST_RESIDUAL_K, MOST_WAY_RAD, RISK, SAMPLES, ThermalForecast
+from twin.thermal.forecast import MOST_RESIDUAL_K, MOST_SD, MOST_WAY_RAD, RISK, SAMPLES, ThermalForecast
 
 Array = np.ndarray
 
@@ -54,13 +54,20 @@ def summary(found: ThermalForecast, so_far: Recording, repetitions: int) -> list
 
 def _doubts(found: ThermalForecast, repetitions: int) -> list[str]:
     """What speaks against a forecast, in sentences."""
-    doubts, joint = list[str](), int(found.residual_k.argmax())
+    doubts, joint, reason = list[str](), int(found.residual_k.argmax()), ""
     if found.residual_k[joint] > MOST_RESIDUAL_K:
-        doubts.append(
-            f"Do not trust this forecast: in the log, joint {joint + 1} has temperatures that differ by "
-            f"{found.residual_k[joint]:.1f} K (RMS) from those that its load explains; in public logs by up to 0.2 K. "
-            "Check the units and the order of temperatures, currents and torques, and the ambient temperature."
+        reason = (
+            f"joint {joint + 1} has temperatures that differ by {found.residual_k[joint]:.1f} K (RMS) from those that "
+            "its load explains; in public logs by up to 0.3 K"
         )
+    elif found.distance_sd > MOST_SD:
+        reason = (
+            f"the load explains the temperatures only for an arm that is {found.distance_sd:.1f} standard deviations "
+            "from the network"
+        )
+    if reason:
+        ask = "Check the units and the order of temperatures, currents and torques, and the ambient temperature."
+        doubts.append(f"Do not trust this forecast: in the log, {reason}. {ask}")
     if repetitions > 1 and found.way_back_rad > MOST_WAY_RAD:
         doubts.append(
             f"The plan ends {found.way_back_rad:.2f} rad from where it begins. The way back, between the repetitions, "
@@ -137,6 +144,7 @@ def card(found: ThermalForecast, so_far: Recording, origin: Mapping[str, str]) -
         "run_s": found.run_s,
         "cycle_s": found.cycle_s,
         "residual_k": np.round(found.residual_k, 3).tolist(),
+        "distance_sd": round(found.distance_sd, 3),
         "way_back_rad": round(found.way_back_rad, 3),
         "now_c": so_far_c(so_far).tolist(),
         "limits": limits(found),

@@ -17,6 +17,7 @@ from twin.thermal.forecast import (
     FROM_LOG_TO_LOG,
     MOST_RESIDUAL_K,
     MOST_S,
+    MOST_SD,
     RISK,
     SAMPLES,
     ThermalForecast,
@@ -190,15 +191,18 @@ def test_a_plan_at_rest_stays_and_late_rows_of_a_moving_one_are_left_out(hour) -
     assert abs(late_c - true_c) < 0.6 * (held_on_c - true_c)
 
 
-def test_temperatures_of_other_joints_are_told(hour) -> None:
-    """Without a word, joint 2 would end 30 K too cool."""
+def test_temperatures_of_other_joints_and_other_currents_are_told(hour) -> None:
+    """Without a word, joint 2 would end 30 K too cool; with half the currents, hundreds of kelvin too hot."""
     _, log, _, found = hour
     assert log.temp_c is not None
     swapped = replace(log, temp_c=log.temp_c[:, [0, 4, 2, 3, 1, 5, 6]])
     wrong = forecast(swapped, held(FULL_REACH_NM), 30, ambient_c=AIR_C)
     assert found.residual_k.max() < MOST_RESIDUAL_K < wrong.residual_k.max()
-    said = [summary(each, log, 30)[0].startswith("Do not trust this forecast") for each in (found, wrong)]
-    assert said == [False, True]
+    assert log.current_a is not None
+    half = forecast(replace(log, current_a=0.5 * log.current_a), held(FULL_REACH_NM), 30, ambient_c=AIR_C)
+    assert found.distance_sd < MOST_SD < half.distance_sd
+    said = [summary(each, log, 30)[0].startswith("Do not trust this forecast") for each in (found, wrong, half)]
+    assert said == [False, True, True]
 
 
 def test_a_forecast_needs_temperatures_time_and_a_whole_plan(hour) -> None:
