@@ -30,6 +30,8 @@ TORQUE_NM = 2 * np.array([105.0] * 4 + [52.0] * 3)
 """Twice the hard safety limit of the torque."""
 TEMP_RANGE_C = (-40.0, 200.0)
 """Range of a motor's temperature sensor."""
+RARE = 0.05
+"""Share of rows beyond these, from which the unit is wrong: without those rows, only the light load would be left."""
 COOL_C, HOT_C = 65.0, ThermalLimits().error_c + 10.0
 """Upper limits of median temperatures over a log, °C: of the coolest motor (an idle wrist has 45), and of any motor (it
 stops at 75)."""
@@ -39,6 +41,8 @@ MOST_STEP_S = 10.0
 """Largest median time between two samples, s: across a longer one neither motion nor heat is known."""
 STALE_S = 8.0
 """Rows that repeat for longer are stale, s. Public logs repeat rows for up to 6.6 s, when their logger was late."""
+EVEN = 1e-11
+"""Change of a step from row to row that is rounding, in the unit of the reading; a step is more than 10⁴ of these."""
 STUCK_S, STUCK_ROWS = 30.0, 20
 """One sensor that repeats its reading for so long, in so many rows, is dead if those of the other joints change."""
 FINE = 0.7
@@ -205,6 +209,7 @@ def judge(time_s: Array, readings: Mapping[str, Array], *, degrees: bool, measur
         return bad
     bad += _stuck(time_s, readings)
     bad += [_stale(time_s, start, end) for start, end in repeats(time_s, readings, STALE_S)]
+    bad += _filled(time_s, readings)
     if "temp_c" in readings:
         bad += _impossible_changes(time_s, readings["temp_c"])
     bad = [replace(found, most=found.most or 2 * len(found.rows) > len(time_s)) for found in bad]
@@ -221,6 +226,20 @@ def judge(time_s: Array, readings: Mapping[str, Array], *, degrees: bool, measur
         *_upright(sound, degrees),
         *(list(_gravity(sound)) or unheld(sound)),
     ]
+
+
+def judge_plan(time_s: Array, readings: Mapping[str, Array], *, degrees: bool) -> list[BadReading]:
+    """Readings that no planned motion of a Gen3 can have: wrong units, or torques that do not hold the arm.
+
+    Args:
+        time_s: As in `judge`, as are the others.
+    """
+    if not len(time_s):
+        return []
+    bad = [*judge_time(time_s), *_out_of_range(readings, degrees)]
+    if not bad and len(time_s) >= LEAST_ROWS and readings["qd"].any():  # else the speeds are those of the angles
+        bad += _motion(time_s, readings, degrees)
+    return bad or unheld(readings)
 
 
 def runs(mask: Array, least: int = 1) -> list[tuple[int, int]]:
@@ -275,7 +294,10 @@ def _out_of_range(readings: Mapping[str, Array], degrees: bool) -> Iterator[BadR
         yield from _limited(q, STOPS_RAD, np.rad2deg(q), "°", what, remedy)
     else:
         what = "beyond its stops, ±2.25, ±2.58, ±2.10 rad for joints 2, 4, 6"
-        yield from _limited(q, STOPS_RAD, q, " rad", what, "Are these degrees?" if np.abs(q).max() > 2 * np.pi else "")
+        turned = q.min() >= 0 and (np.abs(_half_turn(q)) <= STOPS_RAD).all()
+        remedy = "Are these degrees?" if np.abs(q).max() > 2 * np.pi else ""
+        remedy = "Do the angles run from 0 to 2π? Give them from −π to π." if turned and not remedy else remedy
+        yield from _limited(q, STOPS_RAD, q, " rad", what, remedy)
     speed = "Are these °/s? The unit is rad/s." if not degrees else "Check the unit, °/s."
     for channel, limit, unit, guess in (
         ("qd", SPEED_RAD_S, " rad/s", speed),
@@ -284,7 +306,7 @@ def _out_of_range(readings: Mapping[str, Array], degrees: bool) -> Iterator[BadR
     ):
         if channel in readings:
             what = f"more than a Gen3 has ({_NAMES[channel]})"
-            yield from _limited(readings[channel], limit, readings[channel], unit, what, guess)
+            yield from _limited(readings[channel], limit, readings[channel], unit, what, guess, RARE)
     if "temp_c" in readings:
         temp_c = readings["temp_c"]
         middle_c, half_k = np.mean(TEMP_RANGE_C), np.ptp(TEMP_RANGE_C) / 2
@@ -304,14 +326,14 @@ _NAMES = {"q": "angle", "qd": "velocity", "tau": "torque", "current_a": "current
 
 
 def _limited(
-    values: Array, most: Array | float, shown: Array, unit: str, what: str, remedy: str
+    values: Array, most: Array | float, shown: Array, unit: str, what: str, remedy: str, share: float = 0.5
 ) -> Iterator[BadReading]:
     outside = np.abs(values) > most
     rows = np.flatnonzero(outside.any(axis=1))
     for row in rows:
         joint = int(outside[row].argmax())
         found = f"joint {joint + 1} at {shown[row, joint]:.5g}{unit} is {what}"
-        yield BadReading(found, remedy, np.array([row]), 2 * len(rows) > len(values))
+        yield BadReading(found, remedy, np.array([row]), len(rows) > share * len(values))
 
 
 def _unit_of(temp_c: Array) -> str:
@@ -387,7 +409,25 @@ def _impossible_changes(time_s: Array, temp_c: Array) -> Iterator[BadReading]:
 
 def _steps(q: Array) -> Array:
     """Change of the angles by at most half a turn, rad, [row − 1, joint]."""
-    return (np.diff(q, axis=0) + np.pi) % (2 * np.pi) - np.pi
+    return _half_turn(np.diff(q, axis=0))
+
+
+def _half_turn(angle: Array) -> Array:
+    """Angles within half a turn of zero, rad."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def _filled(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]:
+    """Rows between which all readings change evenly, as those between the ends of a gap do after interpolation."""
+    steps = [_steps(values) if name == "q" else np.diff(values, axis=0) for name, values in readings.items()]
+    step = np.concatenate(steps, axis=1)
+    moves = (np.abs(step[1:]) > 1e4 * EVEN).any(axis=1, keepdims=True)
+    even = ((np.abs(np.diff(step, axis=0)) <= EVEN) & moves).all(axis=1)
+    for a, b in runs(np.asarray(even), 4):
+        if (span_s := time_s[b + 1] - time_s[a]) > STUCK_S:
+            what = f"all readings change evenly for {span_s:.3g} s, with no noise"
+            remedy = "Was a gap filled by interpolation? These lines count as one."
+            yield BadReading(what, remedy, np.arange(a + 1, b + 1))
 
 
 def _interleaved(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]:

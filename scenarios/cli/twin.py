@@ -1,5 +1,6 @@
 """Commands of the digital twin: `thermofleet twin …`."""
 
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -74,9 +75,28 @@ def identify_command(
     worst = sorted(max(rms) for rms in network.rms_k.values())
     residual = f"median {worst[len(worst) // 2]:.2f} K, largest {worst[-1]:.2f} K"
     say(f"Residual at the worst joint of a recording: {residual}.", out_console)
+    for sentence in doubts_of(network):
+        say(sentence, out_console)
     advice = "" if ambient is not None else ", assumed; give another one with --ambient"
     say(f"Ambient temperature: {ambient_c:g} °C{advice}.", out_console)
     say("Nothing was written; --out FOLDER keeps it." if out is None else f"Written to {out}.", out_console)
+
+
+def doubts_of(network: "Identified") -> list[str]:
+    """What speaks against an identified network, in sentences."""
+    from twin.thermal.forecast import MOST_RESIDUAL_K, MOST_SD
+
+    doubts, worst_k = list[str](), max(map(max, network.rms_k.values()))
+    far, sd = max(
+        ((p, abs(math.log(p.value / p.prior)) / p.prior_sd) for p in network.parameters), key=lambda each: each[1]
+    )
+    if sd > MOST_SD:
+        of = "" if far.joint is None else f" of joint {far.joint}"
+        doubts.append(f"{far.name}{of} is {far.value / far.prior:.2g} times that of a nominal Gen3")
+    if worst_k > MOST_RESIDUAL_K:
+        doubts.append(f"a residual of {worst_k:.1f} K, where public logs have up to 0.3 K")
+    ask = "Check the units and the order of temperatures, currents and torques."
+    return [f"Do not trust this network: {', and '.join(doubts)}. {ask}"] if doubts else []
 
 
 def parameter_table(network: "Identified") -> Table:

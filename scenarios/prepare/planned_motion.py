@@ -8,6 +8,7 @@ from scenarios.prepare.fleet import prepare_arm
 from scenarios.progress import Progress, quiet
 from scenarios.spec.jobs import works_of
 from scenarios.spec.load import load
+from twin.logs.reader import SUFFIXES as LOGS
 from twin.logs.recording import Recording
 
 SUFFIX = ".toml"
@@ -26,8 +27,8 @@ def motion_of(job: str, arm: str | None = None, progress: Progress = quiet) -> t
     """
     file, suffix, stream = job.partition(f"{SUFFIX}/")  # names of jobs may have slashes
     name, slash, stream = (file + suffix[:-1], suffix, stream) if suffix else job.rpartition("/")
-    if not slash:
-        raise FleetError(f"--plan must be a file, or SCENARIO/JOB as quickstart/hold_part (got '{job}').")
+    if not slash or job.lower().endswith(LOGS):
+        raise FleetError(f"--plan must be a file, or SCENARIO/JOB as quickstart/hold_part; there is no file '{job}'.")
     scenario = load(name)
     streams = {each.name: each for each in scenario.jobs}
     if stream not in streams:

@@ -12,7 +12,7 @@ from scenarios.show.page import Chart, Page, Section, origin_table
 from scenarios.show.words import duration
 from scenarios.table import Column, Table
 from twin.logs.recording import Recording
-from twin.thermal.forecast import RISK, SAMPLES, ThermalForecast
+from twin.thermal.forecast import MOST_RESIDUAL_K, MOST_SD, MOST_WAY_RAD, RISK, SAMPLES, ThermalForecast
 
 Array = np.ndarray
 
@@ -24,11 +24,11 @@ MINUTE_S = 60.0
 
 
 def summary(found: ThermalForecast, so_far: Recording, repetitions: int) -> list[str]:
-    """The hottest motor at the end, and the highest safe start, in sentences; `limit_table` has the rest."""
+    """What speaks against the forecast, the hottest motor at the end, and the highest safe start, in sentences."""
     low, middle, high = (each[-1] for each in found.interval())
     hottest, warning_c = int(middle.argmax()), ThermalLimits().warning_c
     warmer_k = found.safe_start_k(warning_c)
-    times = "1 repetition" if repetitions == 1 else f"{repetitions} repetitions"
+    times, doubts = "1 repetition" if repetitions == 1 else f"{repetitions} repetitions", _doubts(found, repetitions)
     first = (
         f"After {times}, {duration(found.run_s)}, joint {hottest + 1} is the hottest: "
         f"{middle[hottest]:.1f} °C (95 % interval {low[hottest]:.1f} to {high[hottest]:.1f}), now "
@@ -36,15 +36,44 @@ def summary(found: ThermalForecast, so_far: Recording, repetitions: int) -> list
     )
     if math.isinf(warmer_k):
         at = f"from an arm at {found.ambient_c:g} °C"
-        return [first, f"No start is safe: P({warning_c:g} °C) is more than {100 * RISK:g} % even {at}."]
+        return [
+            *doubts,
+            first,
+            f"No start of the planned run is safe: P({warning_c:g} °C) is more than {100 * RISK:g} % even {at}.",
+        ]
     # Rounded down, so that it is below the limit.
     start_c = math.floor(10.0 * (float(so_far_c(so_far).max()) + warmer_k) - 1e-6) / 10.0
     than = f"{abs(warmer_k):.1f} K {'warmer' if warmer_k >= 0 else 'cooler'} than now"
     return [
+        *doubts,
         first,
         f"Highest safe start of the planned run: hottest motor at {start_c:.1f} °C, if all motors and housings are "
         f"{than}.",
     ]
+
+
+def _doubts(found: ThermalForecast, repetitions: int) -> list[str]:
+    """What speaks against a forecast, in sentences."""
+    doubts, joint, reason = list[str](), int(found.residual_k.argmax()), ""
+    if found.residual_k[joint] > MOST_RESIDUAL_K:
+        reason = (
+            f"joint {joint + 1} has temperatures that differ by {found.residual_k[joint]:.1f} K (RMS) from those that "
+            "its load explains; in public logs by up to 0.3 K"
+        )
+    elif found.distance_sd > MOST_SD:
+        reason = (
+            f"the load explains the temperatures only for an arm that is {found.distance_sd:.1f} standard deviations "
+            "from the network"
+        )
+    if reason:
+        ask = "Check the units and the order of temperatures, currents and torques, and the ambient temperature."
+        doubts.append(f"Do not trust this forecast: in the log, {reason}. {ask}")
+    if repetitions > 1 and found.way_back_rad > MOST_WAY_RAD:
+        doubts.append(
+            f"The plan ends {found.way_back_rad:.2f} rad from where it begins. The way back, between the repetitions, "
+            "is not in the forecast: give a plan that returns."
+        )
+    return doubts
 
 
 def so_far_c(so_far: Recording) -> Array:
@@ -114,6 +143,9 @@ def card(found: ThermalForecast, so_far: Recording, origin: Mapping[str, str]) -
         "origin": dict(origin),
         "run_s": found.run_s,
         "cycle_s": found.cycle_s,
+        "residual_k": np.round(found.residual_k, 3).tolist(),
+        "distance_sd": round(found.distance_sd, 3),
+        "way_back_rad": round(found.way_back_rad, 3),
         "now_c": so_far_c(so_far).tolist(),
         "limits": limits(found),
         "time_s": found.time_s[found.in_run].tolist(),

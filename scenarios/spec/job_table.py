@@ -7,10 +7,11 @@ begin of the shift is known as a date, `h:mm` is a time of day, and a date witho
 
 import csv
 import io
+import logging
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from datetime import UTC, datetime, time, timedelta, tzinfo
+from datetime import UTC, date, datetime, time, timedelta, tzinfo
 from difflib import get_close_matches
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
@@ -29,6 +30,7 @@ from fleet.files import decode_text
 from fleet.job import BOUNDS, DWELL_S, KINDS, check_alternatives, check_bounds, check_duration, check_dwell
 from scenarios.spec.units import question
 
+_LOG = logging.getLogger(__name__)
 SUFFIXES = (".csv", ".tsv", ".parquet", ".xlsx")
 """Of job tables; other files of jobs are JSON."""
 MOST_ROWS, MOST_BYTES = 10_000, 20_000_000
@@ -40,6 +42,10 @@ DAY_S = 86_400.0
 GRAMS, LIGHT_KG = 0.001, 0.02
 """A gram in kg, and the mass below which all payloads in grams are probably in kg."""
 YEARS = (1970, 2200)
+SHEET_ZERO = datetime(1899, 12, 30)
+"""From which a spreadsheet counts days."""
+MOST_SHEET_S = 7 * DAY_S
+"""Of a shift without a known end: numbers of days further on are times in seconds."""
 DATE = "a date with time and zone, as 2026-11-23T06:00+01:00"
 _CLOCK = re.compile(r"(\d{1,4}):([0-5]\d)(?::([0-5]\d(?:[.,]\d+)?))?")
 _ARROW, _OR = re.compile(r"->|→|>"), re.compile(r"[|;,]")
@@ -52,6 +58,8 @@ _FLAGS = {
     **dict.fromkeys(("yes", "true", "1", "hard", "ja", "wahr"), True),
     **dict.fromkeys(("no", "false", "0", "soft", "nein", "falsch"), False),
 }
+_WORKBOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
+"""First bytes of XLSX, ODS and ZIP, and of XLS."""
 Answer = TypeVar("Answer", Admission, JobStatus)
 Cell = Any
 """A text, number, date, list or None, according to the file."""
@@ -107,45 +115,80 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
     if clock := _CLOCK.fullmatch(text):
         hours, minutes, seconds = (float((part or "0").replace(",", ".")) for part in clock.groups())
         given_s = 3600 * hours + 60 * minutes + seconds
-        if begin is None:
-            return given_s
-        if given_s > DAY_S:
-            raise ValueError(f"with shift_begin, h:mm is a time of day, up to 24:00 (got '{text}')")
-        midnight = begin.replace(hour=0, minute=0, second=0, microsecond=0)
-        today, tomorrow = (midnight + timedelta(days=days, seconds=given_s) for days in (0, 1))  # by the clock
-        since_s = since(begin, today)
-        if since_s < 0 and since(begin, tomorrow) > dialect.horizon_s:
-            raise ValueError(
-                f"'{text}' is outside the shift, which begins at {begin:%H:%M} and ends before {text} of the next day"
-            )
-        return since_s if since_s >= 0 else since(begin, tomorrow)
+        return given_s if begin is None else _clock_seconds(text, given_s, begin, dialect.horizon_s)
     if isinstance(cell, str) and (dotted := _DOTTED_CLOCK.fullmatch(text)):
         number = f"{float(text.replace(',', '.')):.3f}"
         raise ValueError(f"is this {dotted[1]}:{dotted[2]}? Give times as h:mm, or a number as {number}")
     if isinstance(cell, str) and (clock := _MILITARY_CLOCK.fullmatch(text)):
         raise ValueError(f"is this {clock[1]}:{clock[2]}? Give times as h:mm, or a number as {int(text)}")
-    with suppress(ValueError):
-        return _number(cell, dialect)
+    try:
+        number = _number(cell, dialect)
+    except ValueError:
+        return _date_seconds(text, cell, begin)
+    if begin is not None and (moment := _of_sheet(number, begin, dialect.horizon_s)):
+        raise ValueError(
+            f"is this {moment:%d %b %Y %H:%M}, in days as a spreadsheet counts? Give a date with time, as "
+            f"{moment:%Y-%m-%dT%H:%M} (got {_shown(cell)})"
+        )
+    return number
+
+
+def _clock_seconds(text: str, given_s: float, begin: datetime, horizon_s: float) -> float:
+    """From the begin of the shift to the next time of day, given in seconds by the clock since midnight, s."""
+    if given_s > DAY_S:
+        raise ValueError(f"with shift_begin, h:mm is a time of day, up to 24:00 (got '{text}')")
+    midnight = begin.replace(hour=0, minute=0, second=0, microsecond=0)
+    today, tomorrow = (midnight + timedelta(days=days, seconds=given_s) for days in (0, 1))
+    moment = today if since(begin, today) >= 0 else tomorrow
+    if moment == tomorrow and since(begin, tomorrow) > horizon_s:
+        raise ValueError(
+            f"'{text}' is outside the shift, which begins at {begin:%H:%M} and ends before {text} of the next day"
+        )
+    check_exists(moment, f"'{text}'")
+    return since(begin, moment)
+
+
+def _date_seconds(text: str, cell: Cell, begin: datetime | None) -> float:
+    """From the begin of the shift to a date with time, s; without a zone it has that of the begin."""
     if german := _GERMAN_DATE.fullmatch(text):
         day, month, year, clock_time = german.groups()
         text = f"{year}-{month:0>2}-{day:0>2}T{clock_time:0>5}"
     try:
-        date = datetime.fromisoformat(text)
+        moment = datetime.fromisoformat(text)
     except ValueError:
         raise ValueError(f"expected seconds, h:mm, h:mm:ss, or {DATE} (got {_shown(cell)})") from None
     if begin is None:
         raise ValueError(f"a date needs shift_begin, the begin of the shift, or --shift-begin (got {_shown(cell)})")
-    if not YEARS[0] <= date.year <= YEARS[1]:
-        raise ValueError(f"expected a year from {YEARS[0]} to {YEARS[1]} (got {date.year})")
-    return since(begin, date if date.tzinfo else date.replace(tzinfo=begin.tzinfo))
+    if len(text) <= len("2026-11-23"):
+        raise ValueError(f"a date needs a time, as {moment:%Y-%m-%d}T14:00 (got {_shown(cell)})")
+    if not YEARS[0] <= moment.year <= YEARS[1]:
+        raise ValueError(f"expected a year from {YEARS[0]} to {YEARS[1]} (got {moment.year})")
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=begin.tzinfo)
+        check_exists(moment, _shown(cell))
+    return since(begin, moment)
+
+
+def _of_sheet(days: float, begin: datetime, horizon_s: float) -> datetime | None:
+    """The date that a spreadsheet stores as these days, if it is on a day of the shift, or on the one after it."""
+    first = (begin.replace(tzinfo=None) - SHEET_ZERO).days
+    if not first <= days < first + 2 + min(horizon_s, MOST_SHEET_S) // DAY_S:
+        return None
+    return SHEET_ZERO + timedelta(days=days)
+
+
+def check_exists(moment: datetime, given: str) -> None:
+    """Raise a ValueError for a time of day that a clock put forward for summer time leaves out."""
+    if moment.astimezone(UTC).astimezone(moment.tzinfo).replace(tzinfo=None) != moment.replace(tzinfo=None):
+        raise ValueError(f"{given} does not exist: summer time leaves out this hour. Give another time")
 
 
 def _job_time(cell: Cell, dialect: _Dialect) -> float:
     """As `_seconds`; with the begin of the shift as a date, not before it."""
     if (time_s := _seconds(cell, dialect)) < 0 and (begin := dialect.begin):
-        date = (begin.astimezone(UTC) + timedelta(seconds=time_s)).astimezone(begin.tzinfo)
+        moment = (begin.astimezone(UTC) + timedelta(seconds=time_s)).astimezone(begin.tzinfo)
         form = "%d %b %Y %H:%M"
-        raise ValueError(f"{date:{form}} is before the shift, which begins on {begin:{form}} (got {_shown(cell)})")
+        raise ValueError(f"{moment:{form}} is before the shift, which begins on {begin:{form}} (got {_shown(cell)})")
     return time_s
 
 
@@ -169,7 +212,14 @@ def seconds_of(given: object, begin: datetime | None, horizon_s: float) -> float
 
 def _names(cell: Cell, _: object) -> tuple[str, ...]:
     parts = cell if isinstance(cell, list) else _OR.split(_text(cell))
-    return tuple(_text(part) for part in parts if _text(part))
+    return tuple(_label(part) for part in parts if _text(part))
+
+
+def _label(cell: Cell, _: object = None) -> str:
+    """A name; a spreadsheet makes dates of names such as 11/10."""
+    if isinstance(cell, date | time):
+        raise ValueError(f"is a date: give its cell the format of a text, and the name anew (got {_shown(cell)})")
+    return _text(cell)
 
 
 def _kind(cell: Cell, _: object) -> str:
@@ -209,7 +259,7 @@ def _is_empty(cell: Cell) -> bool:
 
 
 _COLUMNS: Mapping[str, tuple[str, Callable[[Cell, _Dialect], object], object]] = {
-    "name": ("name", lambda cell, _: _text(cell), ""),
+    "name": ("name", _label, ""),
     "kind": ("kind", _kind, ""),
     "places": ("every_places", _places, ()),
     "payload": ("payload_kg", _number, 0.0),
@@ -232,6 +282,8 @@ _SPELLINGS = {
     **{f"{each}_{unit}": (each, s) for each in ("release", "due") for unit, s in (("s", 1.0), ("min", 60.0))},
 }
 """Column and factor of a heading in lower case, without spaces and brackets."""
+_UNIT = re.compile("ms|s|sec|mins?|minutes|h|hrs?|hours|d|days|mg|g|kg|t|oz|lbs?|n|kn|kp|kgf")
+"""Of headings; a column has those in `_SPELLINGS` only, so that no numbers of another one are taken."""
 
 
 class _Faults(dict[tuple[str, str], list[int]]):
@@ -327,7 +379,11 @@ def _read_head(number: int, head: Sequence[Cell], faults: _Faults) -> dict[int, 
             continue
         key = re.sub(r"[^a-z]+", "_", text.lower()).strip("_")
         column, factor = _SPELLINGS.get(key, ("", 1.0))
-        if not column:
+        stem, _, unit = key.rpartition("_")
+        if not column and stem in _COLUMNS and _UNIT.fullmatch(unit):
+            known = [each for each, (of, _) in _SPELLINGS.items() if of == stem and each.startswith(stem)]
+            faults.add(number, text, f"unknown unit of '{stem}'. Convert its numbers; allowed are {', '.join(known)}")
+        elif not column:
             close = get_close_matches(key, _SPELLINGS, n=1)
             hint = f"; did you mean '{close[0]}'?" if close else "."
             faults.add(number, text, f"unknown{hint} Allowed: {', '.join(_COLUMNS)}. Put # before it to ignore it")
@@ -480,6 +536,8 @@ def read_bytes(path: Path, where: str) -> bytes:
 
 def text_of(content: bytes, where: str) -> str:
     """The text of a file, as `decode_text` reads it; raises a ScenarioError for other data."""
+    if content.startswith(_WORKBOOKS):
+        raise ScenarioError(f"{where} is a workbook or an archive. Save its sheet as CSV, or as XLSX with this ending.")
     if "\0" in (text := decode_text(content)):
         raise ScenarioError(f"{where} is not a text file in UTF-8: it has NUL bytes. Save it as UTF-8.")
     return text
@@ -511,9 +569,12 @@ def _xlsx_rows(content: bytes, where: str) -> Rows:
         )
     except Exception as error:  # also those of zipfile and of an XML parser
         raise ScenarioError(f"{where} is not an XLSX file ({error}).") from error
-    if not values.worksheets:
+    shown = [each for each in values.worksheets if each.sheet_state == "visible"]
+    if not shown:
         raise ScenarioError(f"{where} has no sheet with cells.")
-    sheet, formulas = values.worksheets[0], written.worksheets[0]
+    sheet, formulas = shown[0], written[shown[0].title]
+    if others := [each.title for each in shown[1:] if each.max_row > 1]:
+        _LOG.warning("%s: the first sheet, '%s', is read, and not %s.", where, sheet.title, ", ".join(others))
     if sheet.max_row > MOST_ROWS + 1 or sheet.max_column > MOST_COLUMNS:
         raise ScenarioError(
             f"{where} has {sheet.max_row} rows and {sheet.max_column} columns; a job table has at most {MOST_ROWS} and "
@@ -521,6 +582,10 @@ def _xlsx_rows(content: bytes, where: str) -> Rows:
         )
     if sheet.merged_cells.ranges:
         raise ScenarioError(f"{where} has merged cells ({min(map(str, sheet.merged_cells.ranges))}): unmerge them.")
+    hidden = [f"row {i}" for i, each in sheet.row_dimensions.items() if each.hidden]
+    hidden += [f"column {name}" for name, each in sheet.column_dimensions.items() if each.hidden]
+    if hidden:
+        _LOG.warning("%s: hidden cells count, too: %s.", where, ", ".join(hidden[:MOST_NUMBERS]))
     for row in formulas.iter_rows():
         for cell in row:
             if cell.data_type == "f" and sheet[cell.coordinate].value is None:
@@ -536,6 +601,8 @@ def _as_shown(cell: Any) -> Cell:
     if isinstance(cell.value, timedelta):
         hours, rest = divmod(cell.value, timedelta(hours=1))
         return f"{hours}:{str(rest)[2:]}"
+    if isinstance(cell.value, datetime) and "h" not in str(cell.number_format).lower():
+        return cell.value.date()
     zeros = re.fullmatch("00+", str(cell.number_format)) and isinstance(cell.value, int)
     return f"{cell.value:0{len(cell.number_format)}d}" if zeros else cell.value
 
@@ -578,9 +645,9 @@ def shift_begin(given: object, where: str, zone: tzinfo | None = None) -> dateti
         return None
     if isinstance(begin, datetime) and (begin.tzinfo or zone) and YEARS[0] <= begin.year <= YEARS[1]:
         begin = begin.replace(tzinfo=begin.tzinfo or zone)
-        if begin.astimezone(UTC).astimezone(begin.tzinfo).replace(tzinfo=None) != begin.replace(tzinfo=None):
-            raise ScenarioError(
-                f"{where} = {given} does not exist: summer time leaves out this hour. Give another time."
-            )
+        try:
+            check_exists(begin, f"{where} = {given}")
+        except ValueError as error:
+            raise ScenarioError(f"{error}.") from error
         return begin.astimezone(zone or begin.tzinfo)
     raise ScenarioError(f"{where} must be {DATE} (got {given}).")

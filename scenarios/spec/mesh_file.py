@@ -45,13 +45,14 @@ def with_meshes(scenario: Scenario, path: Path) -> Scenario:
 def _with_surface(fixture: Fixture, file: Path, where: str) -> Fixture:
     mesh = _read(file, where)
     if not 0 < len(mesh.faces) <= MOST_TRIANGLES:
-        advice = "Export it more coarsely" if len(mesh.faces) else "Export the shape as a surface"
+        none = "Only shapes that collide count" if file.suffix.lower() in MODELS else "Export the shape as a surface"
+        advice = "Export it more coarsely" if len(mesh.faces) else none
         raise ScenarioError(f"{where} has {len(mesh.faces)} triangles; allowed are 1 to {MOST_TRIANGLES}. {advice}.")
     low, high = mesh.extents.min(), mesh.extents.max()
     fits = [unit for unit, m in UNITS.items() if m * low >= LEAST_FIXTURE_M and m * high <= MOST_FIXTURE_M]
     if fixture.unit not in fits:
-        size = " × ".join(f"{length:.4g}" for length in mesh.extents)
-        ask = f' Is this in {fits[0]}? Give unit = "{fits[0]}".' if fits else ""
+        size, meant = (_size(k * mesh.extents) for k in (1.0, UNITS[fits[0]] if fits else 1.0))
+        ask = f' Is this in {fits[0]} ({meant} m)? Give unit = "{fits[0]}".' if fits else ""
         allowed = f"between {LEAST_FIXTURE_M:g} and {MOST_FIXTURE_M:g} m"
         raise ScenarioError(f"{where} is {size} {fixture.unit} large; each length must be {allowed}.{ask}")
     mesh.apply_scale(UNITS[fixture.unit])
@@ -138,9 +139,14 @@ def _convex_parts(mesh: Any, where: str) -> list[np.ndarray]:
             raise ScenarioError(f"{where} has more than {MOST_PARTS} separate parts. Leave out small ones.")
     for points in flat:
         if not _is_inside(points, kept):
-            size = " × ".join(f"{length:.3g}" for length in np.ptp(points, axis=0))
+            size = _size(np.ptp(points, axis=0))
             raise ScenarioError(f"{where} has a flat part of {size} m. Give it a thickness, or leave it out.")
     return [hull.points[hull.vertices] for hull in kept]
+
+
+def _size(lengths: np.ndarray) -> str:
+    """Lengths as 0.3 × 0.2 × 0.4."""
+    return " × ".join(f"{length:.4g}" for length in lengths)
 
 
 def _is_inside(points: np.ndarray, hulls: list[Any]) -> bool:

@@ -26,7 +26,7 @@ from scenarios.spec.calendar import check_breaks, with_calendar, zone_of
 from scenarios.spec.job_table import cycle_of, read_bytes, read_job_table, shift_begin, stream_fields, text_of
 from scenarios.spec.mesh_file import with_meshes
 from scenarios.spec.schema import JobStream, Scenario
-from scenarios.spec.units import check_times, check_units
+from scenarios.spec.units import check_ambient, check_times, check_units
 
 _WORDS = {
     "float": "a number",
@@ -164,6 +164,7 @@ def parse_toml(content: bytes, path: Path) -> Scenario:
         scenario = parse_scenario({"name": path.stem, **raw}, path)
     except RecursionError as error:
         raise ScenarioError(f"{path.name}: its tables are nested too deeply; a scenario needs 4 levels.") from error
+    check_ambient([time_s for time_s, _ in scenario.ambient.points], scenario.horizon_s, f"{path.name}: ambient.points")
     for i, stream in enumerate(scenario.jobs):
         if stream.numbered and stream.arrivals.times_s is not None:
             times = [time + stream.arrivals.start_s for time in stream.arrivals.times_s]

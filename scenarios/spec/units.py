@@ -37,7 +37,12 @@ _MISTAKES: Mapping[str, _Mistake] = {
     "clearance_m": _Mistake("millimetres", 0.5, 20_000.0),
 }
 """By key, at any depth of a file."""
+_FAHRENHEIT: Mapping[str, _Mistake] = {
+    **dict.fromkeys(("warning_c", "error_c", "restart_c"), _Mistake("°F", 110.0, 263.0)),
+}
+"""Of limits of motors, which stop at 75 °C."""
 _MEANT: Mapping[str, Callable[[float], str]] = {
+    "°F": lambda f: f"{f:g} °F is {(f - 32) / 1.8:.1f} °C. Give °C.",
     "kelvin": lambda k: f"{k:g} K is {k - 273.15:.1f} °C. Give °C.",
     "grams": lambda g: f"{g:g} g is {g / 1000:g} kg. Give kg.",
     "millimetres": lambda mm: f"{mm:g} mm is {mm / 1000:g} m. Give m.",
@@ -67,10 +72,11 @@ def question(key: str, numbers: Sequence[float]) -> str:
         turns = [abs(each) for each in numbers if abs(each) in _TURNS]
         if turns and all(not each or abs(each) in _TURNS for each in numbers):
             return f"is this radians? {turns[0]:g} rad is {degrees(turns[0]):.0f}°. Give degrees."
-    mistake, worst = _MISTAKES.get(key), max(numbers, key=abs)
-    if mistake is None or not mistake.low <= abs(worst) <= mistake.high:
-        return ""
-    return f"is this {mistake.unit}? {_MEANT[mistake.unit](worst)}"
+    worst = max(numbers, key=abs)
+    for mistakes in (_MISTAKES, _FAHRENHEIT):
+        if (mistake := mistakes.get(key)) and mistake.low <= abs(worst) <= mistake.high:
+            return f"is this {mistake.unit}? {_MEANT[mistake.unit](worst)}"
+    return ""
 
 
 def _numbers(raw: object, place: str = "", key: str = "") -> Iterator[tuple[str, str, list[float]]]:
@@ -125,6 +131,12 @@ def check_times(times_s: Sequence[float], horizon_s: float, where: str, names: S
         _LOG.warning("%s: all %d times are within %g s of a shift of %g s.%s", where, count, last, horizon_s, question)
 
 
+def check_ambient(times_s: Sequence[float], horizon_s: float, where: str) -> None:
+    """Log a warning if the times of ambient temperatures are probably in another unit; `where` begins it."""
+    if times_s and (asked := _unit_of_times(times_s, horizon_s)):
+        _LOG.warning("%s: the last time is %g.%s", where, max(times_s), asked)
+
+
 def _first_outside(times_s: Sequence[float], horizon_s: float, names: Sequence[str]) -> str:
     """The first of the named times outside the shift, after a colon; "" without names."""
     outside = [f"{name} at {time:.15g} s" for name, time in zip(names, times_s, strict=False) if time >= horizon_s]
@@ -141,6 +153,7 @@ def _unit_of_times(times_s: Sequence[float], horizon_s: float) -> str:
     middle = sorted(times_s)[len(times_s) // 2]  # a single date beyond the shift is no unit
     if middle >= horizon_s and last / 1000 < horizon_s and last >= 10 * horizon_s:
         return f" Are these milliseconds? {last:g} ms is {last / 1000:g} s. Give seconds."
-    if len(times_s) >= FEW and horizon_s / 2 <= 60 * last <= horizon_s:
-        return f" Are these minutes? {last:g} min is {60 * last:g} s. Give seconds."
+    for unit, short, unit_s in (("minutes", "min", 60), ("hours", "h", 3600), ("days", "d", 86_400)):
+        if len(set(times_s)) >= FEW and horizon_s / 2 <= unit_s * last <= horizon_s:
+            return f" Are these {unit}? {last:g} {short} is {unit_s * last:g} s. Give seconds."
     return ""

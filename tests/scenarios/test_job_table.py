@@ -165,7 +165,7 @@ def test_rows_may_wait_for_rows_below_them(tmp_path):
     assert [(job.name, job.after) for job in jobs] == [("a", ("b",)), ("b", ())]
 
 
-def test_parquet_and_xlsx_have_the_jobs_of_the_csv(tmp_path):
+def test_parquet_and_xlsx_have_the_jobs_of_the_csv(tmp_path, caplog):
     csv_file = tmp_path / "jobs.csv"
     csv_file.write_text("\n".join([SHORT, *ROWS]), encoding="utf-8")
     jobs = list(read_job_table(csv_file).values())
@@ -190,10 +190,27 @@ def test_parquet_and_xlsx_have_the_jobs_of_the_csv(tmp_path):
     book.save(tmp_path / "jobs.xlsx")
     assert list(read_job_table(tmp_path / "jobs.xlsx").values()) == jobs
     name = book.active["A2"]
+    name.value = datetime(2026, 10, 11)  # as a sheet reads 11/10
+    book.save(tmp_path / "jobs.xlsx")
+    with pytest.raises(ScenarioError, match="row 2, column name: is a date: give its cell the format of a text"):
+        read_job_table(tmp_path / "jobs.xlsx")
     name.value, name.number_format = 12, "0000"  # as a sheet shows 0012
     book.active["J3"].value = None  # which waited for the row before
     book.save(tmp_path / "jobs.xlsx")
+    book.create_sheet("old", 0).append(["x"])
+    book.worksheets[0].sheet_state = "hidden"
+    book.create_sheet("other").append(["x"])
+    book["other"].append(["y"])
+    book["Sheet"].row_dimensions[3].hidden = True
+    book["Sheet"]["F3"].value, book["Sheet"]["F3"].number_format = datetime(2026, 11, 24), "dd/mm/yyyy"
+    book.save(tmp_path / "jobs.xlsx")
+    with pytest.raises(ScenarioError, match="row 3, column release: a date needs a time, as 2026-11-24T14:00"):
+        read_job_table(tmp_path / "jobs.xlsx", begin=BEGIN)
+    book["Sheet"]["F3"].value = None
+    book.save(tmp_path / "jobs.xlsx")
     assert [job.name for job in read_job_table(tmp_path / "jobs.xlsx").values()] == ["0012", "hold 1"]
+    assert "hidden cells count, too: row 3." in caplog.text
+    assert "the first sheet, 'Sheet', is read, and not other." in caplog.text
 
 
 def time_of(cell: str) -> clock:
@@ -270,9 +287,22 @@ def test_what_a_german_spreadsheet_writes_is_read_or_asked_about(tmp_path):
             "a;hold;bench;;;22.11.2026 6:00;;;;",
             "column release: 22 Nov 2026 06:00 is before the shift, which begins on 23 ",
         ),
+        ("a;hold;bench;;;;46349,27;;;", "column due: is this 23 Nov 2026 06:28, in days as a spreadsheet counts? Give"),
+        ("a;hold;bench;;;;2026-11-24;;;", "column due: a date needs a time, as 2026-11-24T14:00 (got '2026-11-24')"),
         ("a;hold;bench;;;6:01;5:00;;;", "column due: '5:00' is outside the shift, which begins at 06:00 and"),
     ):
         assert sentence in faults_of(tmp_path, f"{SHORT.replace(',', ';')}\n{row}\n", begin)
+
+
+def test_a_time_of_day_that_summer_time_leaves_out_is_told(tmp_path):
+    begin = 'time_zone = "Europe/Berlin"\nshift_begin = 2026-03-29T01:59:00'
+    for release, exists in (("2:30", False), ("2026-03-29T02:30", False), ("3:00", True)):
+        text = f"{SHORT}\na,hold,bench,,,{release},,,,\n"
+        if exists:
+            assert drawn(small_table(tmp_path, text, begin), 0)[0].release_s == 60.0
+        else:
+            told = faults_of(tmp_path, text, begin)
+            assert f"column release: '{release}' does not exist: summer time leaves out this hour" in told
 
 
 def test_only_plain_numbers_are_scaled_to_the_unit_of_a_heading(tmp_path):
@@ -335,6 +365,7 @@ def test_what_a_workbook_hides_is_told(tmp_path):
 
 
 HEADS = {
+    "name,kind,places,dwell (min)": "column dwell (min): unknown unit of 'dwell'. Convert its numbers; allowed ",
     "name,kind,places,paylod": "column paylod: unknown; did you mean 'payload'? Allowed: name, kind, places",
     "name,kind": "row 1: no column places; every job needs name, kind, places.",
     "name,kind,places,due,due_s": "column due_s: there is another column 'due'; keep one.",
@@ -351,6 +382,11 @@ def test_a_wrong_head_is_told(tmp_path, head, sentence):
 def test_a_file_that_is_no_table_is_told(tmp_path):
     for name, content, sentence in (
         ("jobs.parquet", b"PAR1", "'jobs.parquet' is not a Parquet file ("),
+        (
+            "jobs.xls",
+            b"\xd0\xcf\x11\xe0\x00",
+            "'jobs.xls' is a workbook or an archive. Save its sheet as CSV",
+        ),
         ("jobs.csv", b"\x00\x01", "'jobs.csv' is not a text file in UTF-8: it has NUL bytes. Save it as UTF-8."),
         ("none.csv", None, "'none.csv': there is no file '"),
     ):

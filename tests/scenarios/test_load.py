@@ -158,6 +158,7 @@ WRONG = [
 
 KELVIN = {"warning_c": 333, "error_c": 348, "restart_c": 323}
 WRONG += [
+    (put("limits", {"warning_c": 140, "error_c": 167}), "limits.warning_c = 140: is this °F? 140 °F is 60.0 °C. Give"),
     (put("limits", KELVIN), "limits.warning_c = 333: is this kelvin? 333 K is 59.9 °C. Give °C."),
     (put("ambient", "points", [[0, 298.15]]), "ambient.points = 298.15: is this kelvin? 298.15 K is 25.0 °C."),
     (put("twin", "cool_c", 313), "twin.cool_c = 313: is this kelvin? 313 K is 39.9 °C."),
@@ -331,6 +332,12 @@ def test_the_warning_counts_the_times_that_lie_outside(tmp_path_factory, inside,
 
 
 def test_a_trace_in_minutes_or_partly_in_milliseconds_is_asked_about(tmp_path, caplog):
+    ambient = "[ambient]\npoints = [[0, 20], [1, 25], [3, 22]]\n"
+    (tmp_path / "cell.toml").write_text(f"{SMALL}\n{ambient}", encoding="utf-8")
+    load(tmp_path / "cell.toml")
+    assert "cell.toml: ambient.points: the last time is 3. Are these minutes? 3 min is 180 s. Give" in caplog.text
+    with_trace(tmp_path, b"0\n0.5\n1.9\n")
+    assert "Are these hours? 1.9 h is 6840 s. Give seconds." in caplog.text
     with_trace(tmp_path, b"0\n60\n118\n")
     assert "all 3 times are within 118 s of a shift of 7200 s. Are these minutes? 118 min is 7080 s." in caplog.text
     with_trace(tmp_path, b"0\n60000\n118000\n")

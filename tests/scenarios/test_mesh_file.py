@@ -173,8 +173,8 @@ def test_small_parts_inside_others_are_left_out(small_toml) -> None:
 
 UNIT = {"mesh": "big.stl"}
 WRONG = [
-    (UNIT, r"'big.stl' is 800 × 600 × 20 m large; .* Is this in mm\? Give unit = \"mm\"\."),
-    ({"mesh": "small.stl", "unit": "mm"}, r"is 0.8 × 0.6 × 0.02 mm large; .* Is this in m\?"),
+    (UNIT, r"'big.stl' is 800 × 600 × 20 m large; .* Is this in mm \(0.8 × 0.6 × 0.02 m\)\? Give unit = \"mm\"\."),
+    ({"mesh": "small.stl", "unit": "mm"}, r"is 0.8 × 0.6 × 0.02 mm large; .* Is this in m \(0.8 × 0.6 × 0.02 m\)\?"),
     (UNIT | {"unit": "cm"}, r"fixtures\[0\].unit: 'cm' is not allowed.* Allowed: m, mm"),
     (UNIT | {"size_m": [1, 1, 1]}, r"fixtures\[0\].size_m must be left out beside `mesh`"),
     ({"mesh": "none.stl"}, r"fixtures\[0\].mesh: 'none.stl': there is no such file\. Paths are relative to"),
@@ -183,6 +183,7 @@ WRONG = [
     ({"mesh": "text.stl"}, r"'text.stl' has 0 triangles; allowed are 1 to 100000. Export the shape as a surface"),
     ({"mesh": "text.glb"}, r"'text.glb' cannot be read as GLB: "),
     ({"mesh": "text.urdf"}, r"'text.urdf' cannot be read as URDF: XML parse error"),
+    ({"mesh": "seen.urdf"}, r"'seen.urdf' has 0 triangles; .* Only shapes that collide count"),
     ({"mesh": "flat.obj"}, r"'flat.obj' is 1 × 1 × 0 m large; each length must be between 0.001 and 10 m"),
     ({"mesh": "tilted.obj"}, r"'tilted.obj' has a flat part of 1 × 1 × 1 m. Give it a thickness, or leave it out"),
     ({"mesh": "fine.stl"}, r"'fine.stl' has 327680 triangles; allowed are 1 to 100000. Export it more coarsely"),
@@ -201,6 +202,8 @@ def test_a_file_that_cannot_be_used_is_refused_in_words(small_toml, fields, sent
     write_stl(folder / "small.stl", ((0, 0, 0), (0.8, 0.6, 0.02)))
     for ending in ("stl", "glb", "urdf"):
         (folder / f"text.{ending}").write_text("a text")
+    seen = '<visual><geometry><box size="1 1 1"/></geometry></visual>'
+    (folder / "seen.urdf").write_text(f'<robot name="a"><link name="a">{seen}</link></robot>')
     (folder / "many.xml").write_text('<mujoco><worldbody><replicate count="1000000000"/></worldbody></mujoco>')
     (folder / "polygon.obj").write_text("f" + 6000 * " 1" + "\n")
     (folder / "nodes.glb").write_bytes(b"glTF" + bytes(8) + (4_000_001).to_bytes(4, "little"))

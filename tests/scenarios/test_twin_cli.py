@@ -5,6 +5,7 @@ import io
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from scenarios.cli.main import main
-from scenarios.cli.twin import subject_of
+from scenarios.cli.twin import doubts_of, network_of, subject_of
 from scenarios.show.twin_report import Size
 from tests.logs import RATE_HZ, logged
 from twin.vae.config import TwinConfig
@@ -231,6 +232,13 @@ def test_an_identified_arm_is_told_whole_with_its_air_and_its_place_and_is_not_r
         f"Ambient temperature: 22 °C, assumed; give another one with --ambient.\nWritten to {tmp_path / 'rc'}"
         in said.out
     )
+    assert "Do not trust" not in said.out
+    network = network_of(tmp_path / "rc")
+    assert network is not None
+    first, *others = network.parameters
+    network = replace(network, parameters=(replace(first, value=9.0 * first.prior), *others), rms_k={"monday": (0.6,)})
+    wrong = "copper_w_per_a2 of joint 1 is 9 times that of a nominal Gen3, and a residual of 0.6 K"
+    assert doubts_of(network)[0].startswith(f"Do not trust this network: {wrong}")
     before = (tmp_path / "rc" / "rc.json").read_bytes()
     again = thermofleet(*identify, "--ambient", 25)
     assert again.code == 2
@@ -277,12 +285,17 @@ def test_a_forecast_follows_from_a_log_and_a_plan(thermofleet, small_toml, tmp_p
     assert [limit["limit_c"] for limit in card["limits"]] == [40.0, 60.0, 75.0]
     assert len(card["time_s"]) == len(card["median_c"]) == len(card["low_c"])
     assert card["run_s"] == pytest.approx(39.5)
+    assert max(card["residual_k"]) < 0.5
+    assert "Do not trust" not in said.out
+    assert re.search(r"The plan ends \d\.\d\d rad from where it begins", said.out)
     of_job = thermofleet("twin", "forecast", "--log", log, "--plan", f"{small_toml}/hold", "--repeat", 3)
+    assert "The plan ends" not in of_job.out
     assert of_job.code == 0, of_job.err
     assert re.search(r"/hold by left: hold [\d.]+ kg at bench", of_job.out), of_job.out
     for word, sentence in (
         ("quickstart/nothing", "'quickstart' has no job 'nothing'. Allowed: hold_part"),
-        ("nothing", "--plan must be a file, or SCENARIO/JOB as quickstart/hold_part (got 'nothing')."),
+        ("nothing", "--plan must be a file, or SCENARIO/JOB as quickstart/hold_part; there is no file 'nothing'."),
+        (tmp_path / "no.csv", "no.csv'."),
     ):
         refused = thermofleet("twin", "forecast", "--log", log, "--plan", word)
         assert (refused.code, sentence in refused.err) == (2, True), refused.err

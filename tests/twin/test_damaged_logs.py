@@ -25,8 +25,8 @@ from fleet.readings import (
     possible_temperatures,
 )
 from fleet.robot import Robot
-from twin.logs.reader import read
-from twin.logs.recording import READINGS, stretches
+from twin.logs.reader import of_arm, read
+from twin.logs.recording import READINGS, Recording, stretches
 
 ARM = ArmModel(Robot(name="logged"))
 TORQUE_PER_AMP = np.array([10.2] * 4 + [6.6] * 3)
@@ -148,6 +148,13 @@ def stood(log: Log) -> str:
     return log.text()
 
 
+def filled(log: Log, first: int, last: int) -> str:
+    """With a gap that is filled by interpolation, as pandas does."""
+    for values in log.groups.values():
+        values[first:last] = np.linspace(values[first - 1], values[last], last - first + 2)[1:-1]
+    return log.text()
+
+
 SWAP = [0, 3, 2, 1, 4, 5, 6]
 TURN = 180 / np.pi
 WHOLE = {
@@ -159,6 +166,10 @@ WHOLE = {
     "tenths": (changed("Temp", lambda v: np.round(v * 10)), r"tenths of °C \(then 3"),
     "thousandths": (changed("Temp", lambda v: np.round(v * 1000)), r"thousandths of °C \(then 3"),
     "mA": (changed("Current", lambda v: v * 1000), "Are these mA"),
+    "current in percent": (
+        changed("Current", lambda v: v * 10),
+        "is more than a Gen3 has .current.*Are these mA",
+    ),
     "currents of another motor": (changed("Current", lambda v: v * 7), "current and torque of joint 2 disagree"),
     "N·mm": (changed("Torque", lambda v: v * 1000), "Are these N·mm"),
     "joints 2 and 4 swapped": (reordered(SWAP, *CHANNELS), "joints 2 and 4 swapped it would be"),
@@ -198,6 +209,16 @@ WHOLE = {
     ),
     "no temperatures": (changed("Temp", np.zeros_like), "temperature of joint 1 is 0, for 14"),
     "degrees as rad": (plainly(scaled("Pos", TURN)), "Are these degrees"),
+    "angles from 0 to 2π": (
+        plainly(lambda log: log.groups.update(Pos=log.groups["Pos"] % (2 * np.pi))),
+        "from 0 to 2π. Give them from −π to π",
+    ),
+    "seconds of the day": (timed(lambda t: (t + 86_340.0) % 86_400.0), "is this midnight. Add 86400 s"),
+    "a clock set back": (timed(lambda t: 1.8e9 + t - 3600.0 * (t > 60.0)), "was the clock set back for winter time"),
+    "seconds since 1970 with six digits": (
+        timed(lambda t: np.round(1.8e9 + 20.0 * t, -3)),
+        "time stands at 1800000000 s from line",
+    ),
     "°/s as rad/s": (plainly(scaled("Velocity", TURN)), "Are (these|the velocities in) °/s"),
     "torque as the Gen3 reports it": (plainly(scaled("Torque", -1.0)), "joint 2 disagree: -.* signs in docs/logs.md"),
     "seventh joint of zeros": (
@@ -262,6 +283,8 @@ LINES = {
     "a torque no arm has": (rows_set("Torque", 1, 80, 81, 999.0), range(80, 81), "joint 2 at -999 N·m is more than"),
     "stale to the end": (lambda: stale(sound(), 270, 300), range(271, 300), "all readings repeat for 14.5 s"),
     "stale between": (lambda: stale(sound(rate_hz=10), 100, 200), range(101, 200), "all readings repeat for 9.9 s"),
+    "a gap filled by interpolation": (lambda: filled(sound(), 100, 190), range(100, 190), "change evenly for 45.5 s"),
+    "a second header": (lambda: sound().text().replace("\n", f"\n{','.join(NAMES)}\n", 2), (), "repeats the header"),
     "a line of NUL bytes": (lambda: doubled(sound().text(), 1, 1) + "\0" * 90, (), "line 302: holds NUL bytes"),
 }
 """Text, rows that are dropped, and the sentence."""
@@ -307,6 +330,7 @@ HARMLESS: dict[str, Callable[[str], bytes]] = {
         f"{n - 1 if n else 'Unnamed: 0'},{line}\n" for n, line in enumerate(text.splitlines())
     ).encode(),
     "a comma at the end": lambda text: text.replace("\n", ",\n").encode(),
+    "old line ends": lambda text: text.replace("\n", "\r").encode(),
     "quoted numbers": lambda text: ('"' + text.replace(",", '","').replace("\n", '"\n"')[:-1]).encode(),
     "quoted names": lambda text: ('"' + text.replace(",", '","', 35).replace("\n", '"\n', 1)).encode(),
 }
@@ -487,6 +511,19 @@ def test_a_log_and_a_plan_of_one_arm_have_one_mount(sign: float) -> None:
     assert mounts_differ(*parts) == (sign < 0)
 
 
+def test_a_log_with_the_other_sign_among_those_of_one_arm_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    logs = list[Recording]()
+    for seed, sign in enumerate((1.0, -1.0, 1.0)):
+        q = START + 0.4 * np.random.default_rng(seed).standard_normal((50, 7))
+        tau = sign * gravity_terms(q)[:, :, 2]
+        logs.append(Recording(name=f"day {seed}", time_s=np.arange(50.0), q=q, qd=0.0 * q, tau=tau))
+    assert of_arm(logs, None, Path("logs")) == logs
+    assert "logs: no mount of one arm explains the torques of all its 3 logs. Without 'day 1', one does." in caplog.text
+    caplog.clear()
+    of_arm(logs[::2], None, Path("logs"))
+    assert not caplog.text
+
+
 def test_a_planned_motion_has_no_sensors(tmp_path: Path) -> None:
     """The torque of a vertical axis is 0 all the time."""
     time_s = np.arange(0.0, 60.0, 0.1)
@@ -501,3 +538,32 @@ def test_a_planned_motion_has_no_sensors(tmp_path: Path) -> None:
     rows = np.column_stack([time_s, q, qd, tau])
     path.write_text("\n".join([head, *(",".join(map(repr, row.tolist())) for row in rows)]) + "\n", encoding="utf-8")
     assert len(read(path, measured=False)[0].time_s) == len(time_s)
+
+
+PLANS: dict[str, tuple[Callable[[dict[str, np.ndarray]], object], str]] = {
+    "milliseconds": (lambda p: p.update(time_s=1000.0 * p["time_s"]), "Are these milliseconds"),
+    "minutes": (lambda p: p.update(time_s=p["time_s"] / 60.0), "Is time in minutes"),
+    "number of the sample": (lambda p: p.update(time_s=10.0 * p["time_s"]), "changes 0.1 times as much"),
+    "°/s": (lambda p: p.update(qd=np.rad2deg(p["qd"]) * 0.2), "changes 0.0873 times as much"),
+}
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_a_plan_in_other_units_is_refused(name: str, tmp_path: Path) -> None:
+    """Its run would be longer, or its friction larger."""
+    time_s = np.arange(0.0, 60.0, 0.1)
+    angle = np.outer(time_s, 0.2 * np.ones(7))
+    q = START + 0.4 * np.sin(angle)
+    plan = {"time_s": time_s, "q": q, "qd": 0.08 * np.cos(angle), "tau": gravity_terms(q)[:, :, 2]}
+    head = ",".join(["time_s", *(f"{name}_{j}" for name in ("q", "qd", "tau") for j in range(1, 8))])
+    path, (change, question) = tmp_path / "plan.csv", PLANS[name]
+    for sound_plan, factor in ((True, 0.0), (True, 1.0), (False, 1.0)):
+        plan["qd"] = factor * 0.08 * np.cos(angle)  # all zero: not given
+        if not sound_plan:
+            change(plan)
+        rows = np.column_stack(list(plan.values())).tolist()
+        path.write_text("\n".join([head, *(",".join(map(repr, row)) for row in rows), ""]), encoding="utf-8")
+        if sound_plan:
+            assert len(read(path, measured=False)[0].time_s) == len(time_s)
+    with pytest.raises(LogError, match=question):
+        read(path, measured=False)

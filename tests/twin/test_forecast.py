@@ -9,9 +9,20 @@ import pytest
 from fleet.errors import FleetError
 from fleet.heat.thermal import NODES
 from fleet.robot import JOINTS
+from scenarios.show.forecast_page import summary
 from tests.twin.test_identify import AIR_C, FULL_REACH_NM, own_arm, working
 from twin.logs.recording import Recording
-from twin.thermal.forecast import DRIFT_K, FROM_LOG_TO_LOG, MOST_S, RISK, SAMPLES, ThermalForecast, forecast
+from twin.thermal.forecast import (
+    DRIFT_K,
+    FROM_LOG_TO_LOG,
+    MOST_RESIDUAL_K,
+    MOST_S,
+    MOST_SD,
+    RISK,
+    SAMPLES,
+    ThermalForecast,
+    forecast,
+)
 from twin.thermal.identify import Identified, Parameter, ParameterVector, identify, nominal_heat_model
 from twin.thermal.thermal_twin import RcTwin
 
@@ -178,6 +189,20 @@ def test_a_plan_at_rest_stays_and_late_rows_of_a_moving_one_are_left_out(hour) -
         np.median(forecast(log, each, 20).sampled_c[:, -1, 1]) for each in (moving, stale, replace(stale, temp_c=None))
     )
     assert abs(late_c - true_c) < 0.6 * (held_on_c - true_c)
+
+
+def test_temperatures_of_other_joints_and_other_currents_are_told(hour) -> None:
+    """Without a word, joint 2 would end 30 K too cool; with half the currents, hundreds of kelvin too hot."""
+    _, log, _, found = hour
+    assert log.temp_c is not None
+    swapped = replace(log, temp_c=log.temp_c[:, [0, 4, 2, 3, 1, 5, 6]])
+    wrong = forecast(swapped, held(FULL_REACH_NM), 30, ambient_c=AIR_C)
+    assert found.residual_k.max() < MOST_RESIDUAL_K < wrong.residual_k.max()
+    assert log.current_a is not None
+    half = forecast(replace(log, current_a=0.5 * log.current_a), held(FULL_REACH_NM), 30, ambient_c=AIR_C)
+    assert found.distance_sd < MOST_SD < half.distance_sd
+    said = [summary(each, log, 30)[0].startswith("Do not trust this forecast") for each in (found, wrong, half)]
+    assert said == [False, True, True]
 
 
 def test_a_forecast_needs_temperatures_time_and_a_whole_plan(hour) -> None:

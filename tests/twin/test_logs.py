@@ -195,6 +195,7 @@ def test_as_many_samples_stay_as_can(times):
     [
         (b"", None, "is empty"),
         (b"\r\n \n", None, "is empty"),
+        (b"BZh91AY&SY", None, "is compressed, and not with gzip. Unpack it"),
         (text(GEN3, []).encode(), None, "holds no good line"),
         (b"a,b\r\n1,2\r\n", 1, "begins with 'a,b', where a Gen3 log has 'Time .s.' and a plain one 'time_s'"),
         (text(GEN3, []).replace(",", ";").encode(), 1, "separated by commas"),
@@ -259,7 +260,7 @@ def test_a_table_that_is_no_telemetry_says_why(tmp_path: Path):
     columns = {"time_s": [0.0, 1.0, 2.0], **{name: [0.5] * 3 for name in PLAIN[1:]}}
     good = {"arm": ["a"] * 3, **columns}
     for table, words, line in (
-        (columns, "lacks the column arm", None),
+        (columns, "lacks the column arm of a telemetry.parquet. Save the log of a real arm as CSV", None),
         (good | {"tick": [1, 2, 3]}, "is part of the recording of a fleet.*`thermofleet bus replay`", None),
         (good | {"q_3": ["x"] * 3}, "column q_3 holds string, not numbers", None),
         ({name: values for name, values in good.items() if name != "q_3"}, "lacks the column q_3", None),
@@ -287,7 +288,9 @@ def test_a_folder_is_read_whole_or_says_what_is_left_out(tmp_path: Path, gen3, c
     gen3(name="a.csv")
     gen3({(2, "Temp_0"): "hot"}, name=".a.csv")
     (tmp_path / "notes.txt").write_text("kept apart")
+    (tmp_path / "a.csv.1").write_text("rotated")
     assert [r.name for r in read_folder(tmp_path)] == ["a", "b"]
+    assert "not read, as a log ends in .csv.gz, .csv, .parquet: a.csv.1" in caplog.text
     (tmp_path / "c.csv").write_text("no log\n")
     with pytest.raises(LogError, match=r"c\.csv, line 1: is not a log"):
         read_folder(tmp_path)

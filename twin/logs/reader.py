@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 
 from fleet.errors import LogError, nearest
 from fleet.files import decode_text
-from fleet.readings import clock_step, judge, repeats, unheld
+from fleet.readings import clock_step, judge, judge_plan, mounts_differ, repeats
 from fleet.robot import JOINTS
 from twin.logs.recording import GAP_S, READINGS, Recording
 
@@ -33,6 +33,8 @@ MOST_SENTENCES = 20
 """Most sentences about one file; further ones are counted."""
 EPOCH_S = 1e8
 """Times from here on are since 1970, s, and are counted from the first."""
+DAY_S, CLOCK_S = 86_400.0, 60.0
+"""A day, and the most by which a step of the clock differs from an hour or a day, s."""
 STRAY_ROWS = 3
 """Longest run of rows with wrong times; a longer one is a clock that was reset."""
 
@@ -85,13 +87,23 @@ def time_damage(time_s: Array, where: Array) -> list[Damage]:
                 raise ValueError(f"time is always {time_s[0]:.10g} s: had the recorder no clock?")
             if np.mean(np.diff(time_s) < 0) > 0.5:
                 raise ValueError("time runs backwards: is the newest line the first? Sort the lines by time.")
-            start = next(row for row in range(1, len(time_s)) if time_s[row] <= time_s[row - 1])
-            raise ValueError(
-                f"time starts again at line {where[start]} ({time_s[start - 1]:.10g} s, then {time_s[start]:.10g} s): "
-                "the file holds several recordings; split it."
-            )
+            raise ValueError(_restart(time_s, where))
         damage += [Damage(int(where[row]), _time_reason(time_s, row)) for row in rows]
     return damage
+
+
+def _restart(time_s: Array, where: Array) -> str:
+    """Sentence on the first time that does not increase, and its probable cause."""
+    row = int(np.diff(time_s).argmin()) + 1
+    before_s, now_s = time_s[row - 1 : row + 1].tolist()
+    if before_s == now_s:
+        return f"time stands at {now_s:.10g} s from line {where[row]} on: has it too few digits?"
+    cause = "the file holds several recordings; split it."
+    if now_s >= EPOCH_S and abs(before_s - now_s - 3600.0) < CLOCK_S:
+        cause = "was the clock set back for winter time? Give times in UTC, or with their zone."
+    elif abs(before_s - now_s - DAY_S) < CLOCK_S:
+        cause = "is this midnight? Add 86400 s to the times of each further day."
+    return f"time starts again at line {where[row]} ({before_s:.10g} s, then {now_s:.10g} s): {cause}"
 
 
 def _time_reason(time_s: Array, row: int) -> str:
@@ -137,6 +149,8 @@ def _kind(reason: str) -> str:
 
 
 _GZIP, _ZIP = b"\x1f\x8b", b"PK\x03\x04"
+_PACKED = (b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf")
+"""First bytes of bzip2, xz, Zstandard and 7z."""
 
 
 def read_csv(path: Path) -> LogTable:
@@ -152,13 +166,16 @@ def read_csv(path: Path) -> LogTable:
     broken = None
     if data.startswith(_ZIP):
         raise LogError(str(path), None, "is a ZIP archive or an XLSX workbook. Unpack it, or save the sheet as CSV.")
+    if data.startswith(_PACKED):
+        raise LogError(str(path), None, "is compressed, and not with gzip. Unpack it.")
     if data.startswith(_GZIP):
         data, broken = _decompress(data)
     elif data and path.suffix == ".gz":
         raise LogError(str(path), None, "ends in .gz but holds no gzip data; was it unpacked or downloaded as a page?")
     if not data.strip():
         raise LogError(str(path), None, f"holds no text ({broken})." if broken else "is empty.")
-    lines = decode_text(data).split("\n")
+    text = decode_text(data)
+    lines = (text if "\n" in text else text.replace("\r", "\n")).split("\n")
     first = next((i for i, raw in enumerate(lines) if not _IGNORED.fullmatch(raw)), 0)
     columns = _header(path, first + 1, lines[first])
     values, where, damage = _rows(lines[first + 1 : -1], columns, first=first + 2)
@@ -244,11 +261,15 @@ def _numbers(line: str, names: Sequence[str], separator: str) -> list[float]:
     """
     cells = line.replace('"', "").split(separator)
     if len(cells) != len(names):
-        raise ValueError(f"{len(cells)} field{'s' * (len(cells) > 1)} where the header has {len(names)}")
+        quoted = "; is there a comma in a quoted number?" if '"' in line and len(cells) > len(names) else ""
+        fields = f"{len(cells)} field{'s' * (len(cells) > 1)}"
+        raise ValueError(f"{fields} where the header has {len(names)}{quoted}")
     with suppress(ValueError):
         numbers = list(map(float, cells))
         if all(map(isfinite, numbers)):
             return numbers
+    if tuple(cell.strip() for cell in cells) == tuple(names):
+        raise ValueError("repeats the header")
     numbers = list[float]()  # cell by cell: a date, a text without a name, or what is wrong
     for column, (cell, name) in enumerate(zip(cells, names, strict=True), start=1):
         try:
@@ -427,7 +448,9 @@ def read_arms(path: Path) -> dict[str, LogTable]:
         raise LogError(str(path), None, f"{reason} `thermofleet bus replay`, or look at it with `thermofleet report`.")
     if ARM not in table.column_names or len(table.column_names) == 1:
         missing = "time_s" if ARM in table.column_names else ARM
-        raise LogError(str(path), None, f"lacks the column {missing} of a telemetry.parquet.")
+        raise LogError(
+            str(path), None, f"lacks the column {missing} of a telemetry.parquet. Save the log of a real arm as CSV."
+        )
     if not table.num_rows:
         raise LogError(str(path), None, "holds no rows.")
     names = tuple(name for name in table.column_names if name not in (ARM, MODE))
@@ -466,7 +489,7 @@ def read(path: str | Path, *, damaged: Damaged = "refuse", measured: bool = True
     Args:
         damaged: "refuse" raises on any unusable line; "skip" drops such lines, logs a warning, and lists them in
             `Recording.dropped`.
-        measured: Whether sensors made a CSV log; of a planned motion only ranges and gravity are judged.
+        measured: Whether sensors made a CSV log; of a planned motion only units, ranges and gravity are judged.
 
     Raises:
         LogError: file, line and reason.
@@ -527,6 +550,8 @@ def read_folder(path: str | Path, *, damaged: Damaged = "refuse") -> list[Record
     files = [f for f in named if not f.name.startswith(".")]
     if not files:
         raise LogError(str(path), None, f"holds no log; a log ends in {', '.join(SUFFIXES)}.")
+    if others := sorted(f.name for f in path.iterdir() if ".csv" in f.name.lower() and f not in named):
+        log.warning("%s: not read, as a log ends in %s: %s", path, ", ".join(SUFFIXES), ", ".join(others))
     by_name = {_name(f): f for f in files}
     for f in files:
         if by_name[_name(f)] != f:
@@ -561,11 +586,24 @@ def of_arm(recordings: Sequence[Recording], arm: str | None, path: Path) -> list
     names = dict.fromkeys(each.name.rpartition("/")[2] for each in recordings if "/" in each.name)
     if arm is None and len(names) > 1:
         raise LogError(str(path), None, f"holds several arms: choose one with --arm ({', '.join(names)}).")
-    if arm is None or not names:
-        return list(recordings)
-    if arm not in names:
+    if arm is not None and names and arm not in names:
         raise LogError(str(path), None, f"has no arm '{arm}'{nearest(arm, names)}")
-    return [each for each in recordings if each.name.rpartition("/")[2] == arm]
+    own = [each for each in recordings if arm is None or not names or each.name.rpartition("/")[2] == arm]
+    _warn_of_mounts(path, own)
+    return own
+
+
+def _warn_of_mounts(where: Path, recordings: Sequence[Recording]) -> None:
+    """Log if no mount explains the torques of all logs, and the log without which one does."""
+    logs = [vars(each) for each in recordings]
+    if len(logs) > 1 and mounts_differ(*logs):
+        odd = next((i for i in range(len(logs)) if not mounts_differ(*logs[:i], *logs[i + 1 :])), None)
+        but = "" if odd is None or len(logs) == 2 else f" Without '{recordings[odd].name}', one does."
+        log.warning(
+            "%s: no mount of one arm explains the torques of all its %d logs.%s Has one of them torques of the other "
+            "sign, or is it of another arm? Leave it out.",
+            *(where, len(logs), but),
+        )
 
 
 def _name(path: Path) -> str:
@@ -598,9 +636,10 @@ def _recording(
     rows = np.flatnonzero(~np.isin(table.where, [d.line for d in damage]))
     good = {channel: values[rows] for channel, values in readings.items()}
     dropped_lines = {d.line for d in damage}
-    bad = judge(time_s[rows], good, degrees=layout.turns, measured=is_csv and measured)
-    if is_csv and not measured and not bad:
-        bad = unheld(good)
+    if is_csv and not measured:
+        bad = judge_plan(time_s[rows], good, degrees=layout.turns)
+    else:
+        bad = judge(time_s[rows], good, degrees=layout.turns, measured=is_csv)
     if part and damaged == "skip":
         bad = [replace(found, most=False) for found in bad]
     for found in sorted(bad, key=lambda found: not found.whole):

@@ -61,6 +61,14 @@ MEMORY_S = 2 * 3600.0
 """Length of the log that is used: three time constants of a housing."""
 LEAST_S, LEAST_SAMPLES = 60.0, 3
 """Least length of the log, and least samples of a plan."""
+MOST_RESIDUAL_K = 0.5
+"""Residual from which a log does not fit the network; of public logs it is at most 0.34 K, with currents three times as
+large 1.8 K (median)."""
+MOST_SD = 4.0
+"""Usual distance of an arm from what was known of it, in standard deviations: up to 3 in public logs, 7.5 with currents
+three times as large."""
+MOST_WAY_RAD = 0.2
+"""Largest way from the end of a plan to its begin that repetitions may leave out."""
 BELOW_AMBIENT_K = 3.0
 """By how much the coolest motor of a powered arm may read less than the ambient temperature."""
 LONGEST_S = 4 * 3600.0
@@ -89,6 +97,12 @@ class ThermalForecast:
     """Length of one repetition."""
     ambient_c: float
     """Assumed ambient temperature."""
+    residual_k: Array
+    """Root mean square difference of the updated network's temperatures from those of the log, K, [joint]."""
+    distance_sd: float
+    """Largest distance of a parameter of the updated network from the one before, in its standard deviations."""
+    way_back_rad: float
+    """Largest change of a joint from the begin to the end of the plan; with repetitions, a motion that is left out."""
 
     @cached_property
     def _planned(self) -> Array:
@@ -218,6 +232,9 @@ def forecast(
         run_s=run_s,
         cycle_s=cycle_s,
         ambient_c=ambient_c,
+        residual_k=np.sqrt(np.mean(problem.unexplained(likely)[0] ** 2, axis=0)),
+        distance_sd=float((np.abs(likely - vector.mean) / np.hypot(vector.sd, FROM_LOG_TO_LOG)).max()),
+        way_back_rad=float(np.abs((plan.q[-1] - plan.q[0] + np.pi) % (2 * np.pi) - np.pi).max()),
     )
 
 
