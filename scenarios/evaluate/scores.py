@@ -36,13 +36,16 @@ class Normalised:
     """Cell of each instance; instances of one cell have the same arms, stations and tasks."""
     score: Mapping[str, Array]
     """By policy, [training of the policy, instance]; a single training counts as given, not as a sample."""
+    best_known: Array
+    """Score of the best known schedule, [instance]; below 1 where the unit is a share of its reward."""
     missing: int = 0
     """Shifts of each policy that have no reference."""
 
     def only(self, chosen: Array) -> "Normalised":
         """Some of the instances, bool [instance]."""
         names, cells = (tuple(np.array(each)[chosen].tolist()) for each in (self.instances, self.cells))
-        return replace(self, instances=names, cells=cells, score={name: x[:, chosen] for name, x in self.score.items()})
+        score = {name: x[:, chosen] for name, x in self.score.items()}
+        return replace(self, instances=names, cells=cells, score=score, best_known=self.best_known[chosen])
 
     @cached_property
     def hot(self) -> Array | None:
@@ -56,6 +59,15 @@ class Normalised:
         """Number of the cell of each instance; None if cells are no sample or each has one instance."""
         names, groups = np.unique(self.cells, return_inverse=True)
         return groups if FEWEST_CELLS <= len(names) < len(self.cells) else None
+
+    @property
+    def reachable(self) -> str:
+        """Mean score of the best known schedules, in all instances and where heat binds or not."""
+        mean = f"{self.best_known.mean():.2f}"
+        if self.hot is None:
+            return mean
+        hot, cool = (self.best_known[part].mean() for part in (self.hot, ~self.hot))
+        return f"{mean} ({hot:.2f} where heat binds, {cool:.2f} where it does not)"
 
     @property
     def unit(self) -> str:
@@ -110,6 +122,8 @@ class SuiteScores:
     unit: str
     """As of `Normalised`."""
     missing: int
+    reachable: str
+    """As of `Normalised`."""
     trainings: int = 1
     """Most trainings of a policy."""
     policies: dict[str, Score]
@@ -118,8 +132,9 @@ class SuiteScores:
     def remarks(self) -> list[str]:
         """What a reader must know of the instances."""
         remarks = [
-            f"Unit: {self.unit}{and_trainings(self.trainings)}. Score: 0 = mean of random, 1 = "
-            "hindsight, the best known schedule; the unit is at least a tenth of its reward."
+            f"Unit: {self.unit}{and_trainings(self.trainings)}. Score: 0 = mean of random, 1 = hindsight, the best "
+            "known schedule, or a tenth of its reward above random if that is more. Mean of the hindsight: "
+            f"{self.reachable}."
         ]
         if self.missing:
             remarks.append(f"{self.missing} shifts of each policy have no reference and are not scored.")
@@ -144,6 +159,7 @@ def scores_of(values: Normalised, baseline: str) -> SuiteScores:
         instances=len(values.instances),
         unit=values.unit,
         missing=values.missing,
+        reachable=values.reachable,
         trainings=max(map(len, values.score.values())),
         policies={
             name: Score(
@@ -249,7 +265,7 @@ def normalised(
     if len(scored) < FEWEST:
         return None
     known = [references[shift] for shift in scored]
-    random, unit = (np.array([getattr(each, name) for each in known]) for name in ("random", "unit"))
+    random, unit, best = (np.array([getattr(each, name) for each in known]) for name in ("random", "unit", "hindsight"))
     score = dict[str, np.ndarray]()
     for policy, rows in by_policy.items():
         rewards: dict[int, dict[Shift, list[float]]] = {}
@@ -265,5 +281,6 @@ def normalised(
         instances=tuple(each.instance for each in known),
         cells=tuple(cell_name(each.instance) for each in known),
         score=score,
+        best_known=(best - random) / unit,
         missing=len({(row.key.fleet, row.key.instance, row.key.seed) for row in first}) - len(scored),
     )

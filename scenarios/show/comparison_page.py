@@ -206,8 +206,8 @@ def verdict(judged: Judged) -> list[str]:
     sentences = [f"{label(best)} {'; it '.join(compared)}."] if compared else []
     whose = "Its mean score" if compared else f"The mean score of {label(best)}"
     sentences.append(
-        f"{whose} is {scores.policies[best].mean.text()}, the best of {len(scores.policies)} policies, where 0 is "
-        f"random and 1 the best schedule known for each of {scores.instances} instances."
+        f"{whose} is {scores.policies[best].mean.text()}, the best of {len(scores.policies)} policies; random has 0, "
+        f"and the best known schedules of the {scores.instances} instances have {scores.reachable}."
     )
     sentences += _below({name: (each.difference, each.p_holm) for name, each in scores.policies.items()}, base)
     return [*sentences, *([CHOICE] if compared else []), *last]
@@ -234,8 +234,8 @@ def _rivals(best: str, others: Sequence[str], base: str) -> Iterator[tuple[str, 
 
 
 def _against(other: str, difference: Interval, role: str, tests: int) -> str:
-    """`beats the baseline wspt by 0.12 [0.08, 0.16] of the way from random to the best known`."""
-    by = f"{difference.text()} of the way from random to the best known"
+    """`beats the baseline wspt by 0.12 [0.08, 0.16] in mean score`."""
+    by = f"{difference.text()} in mean score"
     if difference.low > 0 and _significant(difference.p, tests):
         return f"beats {role} {label(other)} by {by}"
     among = f", not significant among {tests} policies" if difference.low > 0 else ""

@@ -39,7 +39,7 @@ def test_the_share_of_a_gain_has_fiellers_interval() -> None:
     gain = 1.0 + 0.4 * np.repeat([-1.0, 1.0], 20)
     names = tuple(f"{n}" for n in range(40))
     score = {"blind": blind[None], "rc": gain[None], "oracle": whole[None]}
-    found = share_of_gain(Normalised(names, names, score), "rc")
+    found = share_of_gain(Normalised(names, names, score, np.ones(40)), "rc")
     t2 = 2.0227**2 / 40  # t of 39 degrees of freedom at .975
     (a, b), (_, c) = np.cov(gain, whole)
     p = np.array([2.0**2 - t2 * c, -2.0 * (1.0 * 2.0 - t2 * b), 1.0**2 - t2 * a])
@@ -47,8 +47,8 @@ def test_the_share_of_a_gain_has_fiellers_interval() -> None:
     best, ends = found.split(" ", 1)
     assert best == "0.50"
     assert json.loads(ends) == pytest.approx([low, high], abs=0.006)
-    assert share_of_gain(Normalised(names, names, score), "oracle") == "1"
-    assert share_of_gain(Normalised(names, names, score), "blind") == "0"
+    assert share_of_gain(Normalised(names, names, score, np.ones(40)), "oracle") == "1"
+    assert share_of_gain(Normalised(names, names, score, np.ones(40)), "blind") == "0"
 
 
 def test_cooling_has_differences_of_value_to_the_first_way() -> None:
