@@ -56,9 +56,8 @@ class Normalised:
 
     @cached_property
     def groups(self) -> Array | None:
-        """Number of the cell of each instance; None if cells are no sample or each has one instance."""
-        names, groups = np.unique(self.cells, return_inverse=True)
-        return groups if FEWEST_CELLS <= len(names) < len(self.cells) else None
+        """As `groups_of`."""
+        return groups_of(self.cells)
 
     @property
     def reachable(self) -> str:
@@ -71,13 +70,8 @@ class Normalised:
 
     @property
     def unit(self) -> str:
-        """What intervals are about, as `200 instances of 9 cells`."""
-        cells, count = len(set(self.cells)), f"{len(self.instances)} instances"
-        if self.groups is not None:
-            return f"{count} of {cells} cells"
-        if FEWEST_CELLS <= cells == len(self.cells):
-            return count
-        return f"{count}, {f'these {cells} cells' if cells > 1 else 'this cell'} only"
+        """As `unit_of`."""
+        return unit_of(self.cells)
 
     def interval(self, values: Array) -> Interval:
         """The interval of the mean of values [training, instance] over the sample."""
@@ -90,6 +84,22 @@ class Normalised:
     def _sample(self, values: Array) -> Array:
         """As `means.interval` takes them."""
         return values[:, None] if self.groups is None else by_group(values, self.groups)
+
+
+def groups_of(cells: Sequence[str]) -> Array | None:
+    """Number of the cell of each instance, from the cells; None if cells are no sample or each has one instance."""
+    names, groups = np.unique(cells, return_inverse=True)
+    return groups if FEWEST_CELLS <= len(names) < len(cells) else None
+
+
+def unit_of(cells: Sequence[str]) -> str:
+    """What intervals over instances of these cells are about, as `200 instances of 9 cells`."""
+    several, count = len(set(cells)), f"{len(cells)} instances"
+    if groups_of(cells) is not None:
+        return f"{count} of {several} cells"
+    if FEWEST_CELLS <= several == len(cells):
+        return count
+    return f"{count}, {f'these {several} cells' if several > 1 else 'this cell'} only"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,13 +29,14 @@ from scenarios.evaluate.comparison import Comparison, compare, comparisons, figu
 from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
 from scenarios.evaluate.scores import Shift
 from scenarios.evaluate.sources import _Random
-from scenarios.evaluate.statistics import Figure
+from scenarios.evaluate.statistics import Figure, interval
 from scenarios.evaluate.store import read_rows
 from scenarios.evaluate.study import Case, Row, RowKey, Study, suite_label
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.show.comparison_page import Judged, comparison_page, points, spans, verdict
 from scenarios.spec.load import load
 from scenarios.spec.schema import Scenario
+from scenarios.suite.splits import manifest
 from scenarios.table import Table
 
 POLICIES = ("random", "round_robin")
@@ -209,6 +210,27 @@ def judged(study: Study, rows: list[Row], known: dict[Shift, Known], baseline: s
         card=study.card,
         command="thermofleet compare quickstart",
     )
+
+
+def test_figures_of_a_suite_are_clustered_by_cell(study: Study):
+    """Three cells of two instances each: the intervals are those of the means of the cells."""
+    cells = dict[str, list[str]]()
+    for line in manifest("test"):
+        cells.setdefault(line.cell, []).append(line.name)
+    names = [name for own in list(cells.values())[:3] for name in own[:2]]
+    rewards = {"wspt": np.zeros(6), "wsept": np.array([1.0, 2.0, 5.0, 4.0, 9.0, 9.0])}
+    several = replace(study, policies=[*rewards], cases=[replace(study.cases[0], name=n, seeds=(0,)) for n in names])
+    blank = Outcome(**dict.fromkeys(FIGURES, 0.0))
+    rows = [
+        Row(RowKey(policy, name, 0, 0, "blind", 0), replace(blank, reward=float(reward)))
+        for policy, own in rewards.items()
+        for name, reward in zip(names, own, strict=True)
+    ]
+    (result,) = comparisons(several, rows, "wspt", "test")
+    found, expected = result.figures["wsept"]["reward"], interval([1.5, 4.5, 9.0])
+    assert (found.low, found.high) == pytest.approx((expected.low, expected.high))
+    assert (found.difference_low, found.p) == pytest.approx((expected.low, expected.p))
+    assert (result.unit, result.draws, found.iqm) == ("6 instances of 3 cells", 3, 5.0)
 
 
 def test_randomised_shifts_have_no_normalised_scores(study: Study):
