@@ -123,9 +123,11 @@ def mean_cell(figure: dict[str, Any], *, is_base: bool) -> str:
     if is_base:
         return text
     low, high = figure["difference_low"], figure["difference_high"]
-    differs = low is not None and (low > 0 or high < 0)
-    text += f" ({signed(figure['difference'])})"
-    return bold_if(differs, text)
+    if low is None:
+        return f"{text} ({signed(figure['difference'])})"
+    own = Interval(figure["difference"], low, high)
+    stars = own.stars(1.0 if figure["p_holm"] is None else figure["p_holm"]).replace("*", "\\*")
+    return f"{text} ({signed(own.mean)}) {stars}".rstrip()
 
 
 def decisions(measured: dict[str, Any]) -> str:
