@@ -252,7 +252,7 @@ def board_top(folder: Path) -> str:
             cells = (title(entry), entry.card.scope, score.mean.text(), hot, cool, f"{mean_of(entry, 'faults'):.2f}")
             rows.append((str(place), *cells, exact.get(entry.card.policy, "")))
     heads = ("", "policy", "scope", "mean score", "heat binds", "it does not", "faults", "true state")
-    return f"{table(heads, rows)}\n\nMean score of the best known schedules: {board.scores.reachable}."
+    return f"{table(heads, rows)}\n\nMean score of the hindsight: {board.scores.reachable}."
 
 
 KNOWLEDGE = {
@@ -340,7 +340,7 @@ def knowledge(folder: Path) -> str:
     heads = ("the arms know", "source", "mean score", "heat binds", "heat binds, surprise", "share of the gain")
     count = (
         f"{len(values.instances)} instances in {len(set(values.cells))} cells; heat binds in {int(hot.sum())}, "
-        f"{int(surprised.sum())} of them with a surprise. Mean score of the best known schedules: {values.reachable}."
+        f"{int(surprised.sum())} of them with a surprise. Mean score of the hindsight: {values.reachable}."
     )
     own, alone = values.only(hot), "trained-alone"
     others = {"torque-alone": "squared torque", "untrained-alone": "errors of the untrained twin"}

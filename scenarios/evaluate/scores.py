@@ -36,8 +36,8 @@ class Normalised:
     """Cell of each instance; instances of one cell have the same arms, stations and tasks."""
     score: Mapping[str, Array]
     """By policy, [training of the policy, instance]; a single training counts as given, not as a sample."""
-    best_known: Array
-    """Score of the best known schedule, [instance]; below 1 where the unit is a share of its reward."""
+    hindsight: Array
+    """Score of the best schedule that a search found, [instance]; below 1 where the unit is a share of its reward."""
     missing: int = 0
     """Shifts of each policy that have no reference."""
 
@@ -45,7 +45,7 @@ class Normalised:
         """Some of the instances, bool [instance]."""
         names, cells = (tuple(np.array(each)[chosen].tolist()) for each in (self.instances, self.cells))
         score = {name: x[:, chosen] for name, x in self.score.items()}
-        return replace(self, instances=names, cells=cells, score=score, best_known=self.best_known[chosen])
+        return replace(self, instances=names, cells=cells, score=score, hindsight=self.hindsight[chosen])
 
     @cached_property
     def hot(self) -> Array | None:
@@ -61,11 +61,11 @@ class Normalised:
 
     @property
     def reachable(self) -> str:
-        """Mean score of the best known schedules, in all instances and where heat binds or not."""
-        mean = f"{self.best_known.mean():.2f}"
+        """Mean score of the hindsight, in all instances and where heat binds or not."""
+        mean = f"{self.hindsight.mean():.2f}"
         if self.hot is None:
             return mean
-        hot, cool = (self.best_known[part].mean() for part in (self.hot, ~self.hot))
+        hot, cool = (self.hindsight[part].mean() for part in (self.hot, ~self.hot))
         return f"{mean} ({hot:.2f} where heat binds, {cool:.2f} where it does not)"
 
     @property
@@ -143,8 +143,8 @@ class SuiteScores:
         """What a reader must know of the instances."""
         remarks = [
             f"Unit: {self.unit}{and_trainings(self.trainings)}. Score: 0 = mean of random, 1 = hindsight, the best "
-            "known schedule, or a tenth of its reward above random if that is more. Mean of the hindsight: "
-            f"{self.reachable}."
+            "schedule that a search found, or a tenth of its reward above random if that is more. Mean of the "
+            f"hindsight: {self.reachable}."
         ]
         if self.missing:
             remarks.append(f"{self.missing} shifts of each policy have no reference and are not scored.")
@@ -291,6 +291,6 @@ def normalised(
         instances=tuple(each.instance for each in known),
         cells=tuple(cell_name(each.instance) for each in known),
         score=score,
-        best_known=(best - random) / unit,
+        hindsight=(best - random) / unit,
         missing=len({(row.key.fleet, row.key.instance, row.key.seed) for row in first}) - len(scored),
     )

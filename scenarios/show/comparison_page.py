@@ -207,7 +207,7 @@ def verdict(judged: Judged) -> list[str]:
     whose = "Its mean score" if compared else f"The mean score of {label(best)}"
     sentences.append(
         f"{whose} is {scores.policies[best].mean.text()}, the best of {len(scores.policies)} policies; random has 0, "
-        f"and the best known schedules of the {scores.instances} instances have {scores.reachable}."
+        f"and the best schedules that a search found for the {scores.instances} instances have {scores.reachable}."
     )
     sentences += _below({name: (each.difference, each.p_holm) for name, each in scores.policies.items()}, base)
     return [*sentences, *([CHOICE] if compared else []), *last]
