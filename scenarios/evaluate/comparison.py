@@ -81,6 +81,8 @@ class Comparison:
     """Normalised scores; None without references of the shifts."""
     randomise: Randomisation = field(default_factory=Randomisation)
     """Of every shift, the same for every policy."""
+    sources: tuple[str, ...] = ()
+    """Of the predictions."""
     failed_baseline: str = ""
     """The baseline that was asked for, if it failed: another one takes its place."""
 
@@ -308,6 +310,7 @@ def comparison_of(
         lead=lead,
         scores=scores,
         randomise=study.randomise or Randomisation(),
+        sources=study.sources,
     )
 
 

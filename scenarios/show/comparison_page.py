@@ -170,6 +170,7 @@ def _sections(judged: Judged) -> Iterator[Section]:
             continue
         about = f"{result.scenario}, {result.unit}. Mean and paired difference to {label(result.baseline)}; {LEGEND}."
         settings = f"Channel: {result.channel_text}. Randomisation: {result.randomise.text}."
+        about += f" Predictions: {', '.join(result.sources)}."
         scope, *groups = result.table.split()
         sentences = (f"{about} {settings}", *result.table.notes)
         yield Section(key=key, title=title, sentences=sentences, details=(*groups, scope))

@@ -240,7 +240,7 @@ def test_randomised_shifts_have_no_normalised_scores(study: Study):
     assert varied.results[0].scores is None
     assert varied.values is None
     assert "Randomisation: ambient temperature +0 to +5 K." in comparison_page(varied)
-    assert "Randomisation: none." in comparison_page(plain)
+    assert "Predictions: blind. Channel: complete. Randomisation: none." in comparison_page(plain)
     assert re.search(r">randomise</t.>\s*<t.[^>]*>none<", comparison_page(plain))
     assert "Hashes of 1 scenario<" in comparison_page(plain)
 
