@@ -28,6 +28,11 @@ LAWS: dict[str, Law] = {
     "lognormal, σ = 0.75": (lambda rng, size: rng.lognormal(0.0, 0.75, size), float(np.exp(0.75**2 / 2))),
 }
 VERY_SKEWED: Law = (lambda rng, size: rng.lognormal(0.0, 1.0, size), float(np.exp(0.5)))
+MANY_EQUAL: Law = (
+    lambda rng, size: (rng.random(size) < 0.45) * rng.lognormal(0.0, 1.0, size),
+    0.45 * float(np.exp(0.5)),
+)
+"""Differences of policies are 0 in many shifts."""
 SEEDS = (3, 5, 10, 20, 40)
 SIZES = ((4, 2, 10), (8, 2, 20), (10, 1, 10))
 """Fleets, trainings and seeds."""
@@ -107,10 +112,11 @@ def measure() -> dict[str, Any]:
     """
     rng = np.random.default_rng(2)
     laws = {**LAWS, "lognormal, σ = 1": VERY_SKEWED}
-    parts_rng = np.random.default_rng(3)
+    parts_rng, zeros_rng = np.random.default_rng(3), np.random.default_rng(4)
     return {
         "seeds": list(SEEDS),
-        "laws": {name: [measured_law(rng, law, n)._asdict() for n in SEEDS] for name, law in laws.items()},
+        "laws": {name: [measured_law(rng, law, n)._asdict() for n in SEEDS] for name, law in laws.items()}
+        | {"0 in 55 %, else lognormal, σ = 1": [measured_law(zeros_rng, MANY_EQUAL, n)._asdict() for n in SEEDS]},
         "sizes": {
             " × ".join(map(str, size)): [
                 measured(shifts(rng, 20_000, size, skewed), 0.0).share for skewed in (False, True)
