@@ -206,8 +206,9 @@ def verdict(judged: Judged) -> list[str]:
     ]
     sentences = [f"{label(best)} {'; it '.join(compared)}."] if compared else []
     whose = "Its mean score" if compared else f"The mean score of {label(best)}"
+    among = f", the best of {len(scores.policies)} policies" if rest else ""
     sentences.append(
-        f"{whose} is {scores.policies[best].mean.text()}, the best of {len(scores.policies)} policies; random has 0, "
+        f"{whose} is {scores.policies[best].mean.text()}{among}; random has 0, "
         f"and the best schedules that a search found for the {scores.instances} instances have {scores.reachable}."
     )
     sentences += _below({name: (each.difference, each.p_holm) for name, each in scores.policies.items()}, base)

@@ -281,6 +281,10 @@ def test_the_first_policy_that_did_not_fail_takes_the_place_of_a_baseline_that_d
     *_, failed, replaced = verdict(about)
     assert failed.startswith("Failed: wspt;")
     assert replaced == "The baseline wspt failed: differences are to wsept."
+    alone = replace(study, policies=["wspt"])
+    (only,) = verdict(judged(alone, rows_of(alone), KNOWN_SHIFTS))
+    assert only.startswith("The mean score of wspt is ")
+    assert "best of" not in only
     assert "Normalised score" in comparison_page(about)
 
 
