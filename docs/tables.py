@@ -60,7 +60,7 @@ from scenarios.evaluate.leaderboard import (
 from scenarios.evaluate.references import load_references, reference_table
 from scenarios.evaluate.rollout import FIGURES, KINDS
 from scenarios.evaluate.scores import Normalised, SuiteScores, normalised, ranked, score_cells, scores_of
-from scenarios.evaluate.statistics import Interval, unit
+from scenarios.evaluate.statistics import LEVEL, Interval, holm, unit
 from scenarios.json_rows import Rows
 from scenarios.policy_loader import trainings_of
 from scenarios.spec.schema import SPLITS, SurpriseKind
@@ -123,9 +123,11 @@ def mean_cell(figure: dict[str, Any], *, is_base: bool) -> str:
     if is_base:
         return text
     low, high = figure["difference_low"], figure["difference_high"]
-    differs = low is not None and (low > 0 or high < 0)
-    text += f" ({signed(figure['difference'])})"
-    return bold_if(differs, text)
+    if low is None:
+        return f"{text} ({signed(figure['difference'])})"
+    own = Interval(figure["difference"], low, high)
+    stars = own.stars(1.0 if figure["p_holm"] is None else figure["p_holm"]).replace("*", "\\*")
+    return f"{text} ({signed(own.mean)}) {stars}".rstrip()
 
 
 def decisions(measured: dict[str, Any]) -> str:
@@ -249,7 +251,8 @@ def board_top(folder: Path) -> str:
             hot, cool = (f"{each.mean:.2f}" if each else "" for each in (score.hot, score.cool))
             cells = (title(entry), entry.card.scope, score.mean.text(), hot, cool, f"{mean_of(entry, 'faults'):.2f}")
             rows.append((str(place), *cells, exact.get(entry.card.policy, "")))
-    return table(("", "policy", "scope", "mean score", "heat binds", "it does not", "faults", "true state"), rows)
+    heads = ("", "policy", "scope", "mean score", "heat binds", "it does not", "faults", "true state")
+    return f"{table(heads, rows)}\n\nMean score of the hindsight: {board.scores.reachable}."
 
 
 KNOWLEDGE = {
@@ -337,13 +340,18 @@ def knowledge(folder: Path) -> str:
     heads = ("the arms know", "source", "mean score", "heat binds", "heat binds, surprise", "share of the gain")
     count = (
         f"{len(values.instances)} instances in {len(set(values.cells))} cells; heat binds in {int(hot.sum())}, "
-        f"{int(surprised.sum())} of them with a surprise."
+        f"{int(surprised.sum())} of them with a surprise. Mean score of the hindsight: {values.reachable}."
     )
     own, alone = values.only(hot), "trained-alone"
     others = {"torque-alone": "squared torque", "untrained-alone": "errors of the untrained twin"}
-    gains = [f"less {what} {shown(own.difference(alone, name), 3)}" for name, what in others.items() if name in found]
-    if alone in found and gains:
-        count += f" There, without thermometers, errors of the twin {' and '.join(gains)}."
+    if {alone, *others} <= found.keys():
+        gains = [own.difference(alone, name) for name in others]
+        adjusted = holm([gain.p for gain in gains]).tolist()
+        texts = [
+            f"less {what} {bold_if(p < 1 - LEVEL, gain.text(3))} (p = {gain.p:.3f}, {p:.3f} after Holm's correction)"
+            for what, gain, p in zip(others.values(), gains, adjusted, strict=True)
+        ]
+        count += f" Where heat binds, without thermometers, errors of the twin {' and '.join(texts)}."
     return table((*heads, "share, surprise", "faults"), rows) + f"\n\n{count}"
 
 
@@ -375,16 +383,19 @@ def surprises(folder: Path) -> str:
     kind = surprise_where_heat_binds(values)
     parts = {each: kind == each for each in ("nothing", *get_args(SurpriseKind))}
     parts["any of these"] = ~np.isin(kind, ("", "nothing"))
-    shown_sources = [name for name in ("rc", "twin", "oracle") if name in found]
+    shown_sources = ("rc", "twin", "oracle")
     rows: list[tuple[str, ...]] = []
     for name, chosen in parts.items():
         own = values.only(chosen)
-        faults = [f"{mean_of(found[source], 'faults', own.instances):.2f}" for source in shown_sources]
+        faults = {source: faults_in(found[source], own.instances) for source in shown_sources}
+        fewer = own.interval((faults["twin"] - faults["rc"])[None])
         means = [f"{own.score[source].mean():.2f}" for source in shown_sources]
-        rows.append((name, str(len(own.instances)), *faults, *means, shown(own.difference("twin", "rc"))))
-    names = ("network", "corrected", "true state")
-    heads = (*(f"faults, {name}" for name in names), *(f"score, {name}" for name in names))
-    return table(("surprise", "instances", *heads, "corrected less network"), rows)
+        counts = [f"{each.mean():.2f}" for each in faults.values()]
+        cells = (f"{len(own.instances)} in {len(set(own.cells))}", *counts, shown(fewer), *means)
+        rows.append((name, *cells, shown(own.difference("twin", "rc"))))
+    sources, less = ("network", "corrected", "true state"), "corrected less network"
+    heads = (*(f"faults, {each}" for each in sources), less, *(f"score, {each}" for each in sources), less)
+    return table(("surprise", "instances in cells", *heads), rows)
 
 
 CENTRAL, ALONE, BLIND = "bid_price", "wsept_local", "wspt"
@@ -400,7 +411,6 @@ def by_question(folder: Path) -> str:
     parts = {f"advantage, {each}": (asks == "advantage") & (level == each) for each in FAULTS}
     parts["advantage, heat binds"] = (asks == "advantage") & (level != "cool")
     parts |= {f"control: {each}": asks == each for each in dict.fromkeys(asks.tolist()) if each != "advantage"}
-    faults = {row.instance: row.figures[FIGURES.index("faults")] for row in found[BLIND].rows if row.figures}
     rows: list[tuple[str, ...]] = []
     for name, chosen in parts.items():
         own = values.only(chosen)
@@ -408,7 +418,7 @@ def by_question(folder: Path) -> str:
         pairs = (ALONE, BLIND), (BASELINE, ALONE), (CENTRAL, ALONE)
         gains = (shown(own.difference(*pair)) for pair in pairs)
         quiet = [each for each in own.instances if lines[each].axes.surprise == "nothing"]
-        count = " (".join(f"{np.mean([faults[each] for each in some]):.2f}" for some in (own.instances, quiet)) + ")"
+        count = " (".join(f"{faults_in(found[BLIND], some).mean():.2f}" for some in (own.instances, quiet)) + ")"
         rows.append((name, str(len(own.instances)), count, *means, *gains))
     heads = (
         "cells, heat",
@@ -446,11 +456,18 @@ def title(entry: BoardResult) -> str:
     return f"`{entry.card.policy}`{more}"
 
 
-def mean_of(entry: BoardResult, figure: str, instances: Sequence[str] = ()) -> float:
-    """Mean of a figure over the shifts of a result that did not fail, of some instances or else of all."""
-    index, some = FIGURES.index(figure), set(instances)
-    values = [row.figures[index] for row in entry.rows if row.figures and (not some or row.instance in some)]
+def mean_of(entry: BoardResult, figure: str) -> float:
+    """Mean of a figure over the shifts of a result that did not fail."""
+    index = FIGURES.index(figure)
+    values = [row.figures[index] for row in entry.rows if row.figures]
     return sum(values) / max(1, len(values))
+
+
+def faults_in(entry: BoardResult, instances: Sequence[str]) -> Array:
+    """Faults in instances of a result of one training without failures, [instance]."""
+    index = FIGURES.index("faults")
+    by_instance = {row.instance: row.figures[index] for row in entry.rows if row.figures}
+    return np.array([by_instance[each] for each in instances])
 
 
 ABLATED = ("heat_wave", "active_waiting")

@@ -330,7 +330,7 @@ def drift_tables(rows: Sequence[Row]) -> dict[str, Table]:
         "CPU s": lambda row: sum(each["cpu_s"] for each in row["retrainings"]),
     }
     costs = [
-        (f"{kind}, {policy}", *(interval([of(row) for row in own]).text(1) for of in measures.values()))
+        (f"{kind}, {policy}", *(interval([of(row) for row in own], least=0.0).text(1) for of in measures.values()))
         for kind in kinds
         for policy in policies
         if (own := matching(rows, kind=kind, policy=policy))

@@ -206,7 +206,8 @@ def feature_tables(rows: Sequence[Row]) -> dict[str, Table]:
     keys = dict.fromkeys((each["target"], each["labels"]) for each in found)
 
     def r2(target: str, labels: int, inputs: str) -> str:
-        return interval([e["r2"] for e in matching(found, target=target, labels=labels, inputs=inputs)]).text()
+        own = matching(found, target=target, labels=labels, inputs=inputs)
+        return interval([each["r2"] for each in own], most=1.0).text()
 
     lines = [(f"{t}, {n} jobs", *(r2(t, n, each) for each in INPUTS)) for t, n in keys]
     return {

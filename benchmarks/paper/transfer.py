@@ -225,15 +225,15 @@ def transfer_tables(rows: Sequence[Row]) -> dict[str, Table]:
     def of(target: str, start: str, count: int, name: str) -> str:
         known = [number(each[name]) for each in matching(trained, target=target, start=start, jobs=count)]
         known = [value for value in known if np.isfinite(value)]  # AUROC needs hot and cool jobs
-        return interval(known).text(3) if known else "unknown"
+        return interval(known, least=0.0).text(3) if known else "unknown"
 
     targets = dict.fromkeys(row["target"] for row in rows)
     errors = [(f"{t}, {start}", *(of(t, start, count, "error") for count in jobs)) for t in targets for start in STARTS]
     saved: list[tuple[str, ...]] = []
     for target in targets:
         own = matching(rows, target=target)
-        ratios = [interval([data_ratio(row, start) for row in own]).text() for start in (RESCALED, FURTHER)]
-        unchanged = interval([row["unchanged_error"] for row in own]).text(3)
+        ratios = [interval([data_ratio(row, each) for row in own], least=0.0).text() for each in (RESCALED, FURTHER)]
+        unchanged = interval([row["unchanged_error"] for row in own], least=0.0).text(3)
         changes = (
             " → ".join(of(target, start, jobs[-1], name).split(" ")[0] for start in (NOTHING, FURTHER))
             for name in ("cpu_s", "auroc")

@@ -4,7 +4,7 @@ python -m benchmarks.statistics.interval_coverage [--out docs/results/coverage.j
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +28,11 @@ LAWS: dict[str, Law] = {
     "lognormal, σ = 0.75": (lambda rng, size: rng.lognormal(0.0, 0.75, size), float(np.exp(0.75**2 / 2))),
 }
 VERY_SKEWED: Law = (lambda rng, size: rng.lognormal(0.0, 1.0, size), float(np.exp(0.5)))
+MANY_EQUAL: Law = (
+    lambda rng, size: (rng.random(size) < 0.45) * rng.lognormal(0.0, 1.0, size),
+    0.45 * float(np.exp(0.5)),
+)
+"""Differences of policies are 0 in many shifts."""
 SEEDS = (3, 5, 10, 20, 40)
 SIZES = ((4, 2, 10), (8, 2, 20), (10, 1, 10))
 """Fleets, trainings and seeds."""
@@ -38,6 +43,8 @@ LIMITED_SEEDS = 10
 """Seeds with which the limits are compared."""
 INSTANCES = tuple(cell.instances for cell in CELLS if cell.split == "test")
 """Instances of each cell of the test split."""
+PARTS = ((18, 18, 6, 18, 6, 18, 6, 18, 18), (12, 8, 4))
+"""Of its cells with at most eight arms where heat binds, and of those with 16 arms or more."""
 
 
 class Measured(NamedTuple):
@@ -81,10 +88,12 @@ def shifts(rng: np.random.Generator, trials: int, size: tuple[int, int, int], sk
     return by_fleet + 0.7 * draw(1, 1, seeds) + draw(fleets, trainings, seeds)
 
 
-def cells_coverage(rng: np.random.Generator, skewed: bool, trials: int = 20_000) -> float:
+def cells_coverage(
+    rng: np.random.Generator, skewed: bool, trials: int = 20_000, instances: Sequence[int] = INSTANCES
+) -> float:
     """Of the mean over instances of several cells: cells and instances differ alike."""
-    groups = np.repeat(np.arange(len(INSTANCES)), INSTANCES)
-    values = effects(rng, (trials, len(INSTANCES)), skewed)[:, groups] + effects(rng, (trials, len(groups)), skewed)
+    groups = np.repeat(np.arange(len(instances)), instances)
+    values = effects(rng, (trials, len(instances)), skewed)[:, groups] + effects(rng, (trials, len(groups)), skewed)
     return measured(np.stack([by_group(each[None], groups) for each in values]), 0.0).share
 
 
@@ -103,9 +112,11 @@ def measure() -> dict[str, Any]:
     """
     rng = np.random.default_rng(2)
     laws = {**LAWS, "lognormal, σ = 1": VERY_SKEWED}
+    parts_rng, zeros_rng = np.random.default_rng(3), np.random.default_rng(4)
     return {
         "seeds": list(SEEDS),
-        "laws": {name: [measured_law(rng, law, n)._asdict() for n in SEEDS] for name, law in laws.items()},
+        "laws": {name: [measured_law(rng, law, n)._asdict() for n in SEEDS] for name, law in laws.items()}
+        | {"0 in 55 %, else lognormal, σ = 1": [measured_law(zeros_rng, MANY_EQUAL, n)._asdict() for n in SEEDS]},
         "sizes": {
             " × ".join(map(str, size)): [
                 measured(shifts(rng, 20_000, size, skewed), 0.0).share for skewed in (False, True)
@@ -117,6 +128,12 @@ def measure() -> dict[str, Any]:
             f"{sum(INSTANCES)} instances of {len(INSTANCES)} cells": [
                 cells_coverage(rng, skewed) for skewed in (False, True)
             ]
+        }
+        | {
+            f"{sum(part)} instances of {len(part)} cells": [
+                cells_coverage(parts_rng, skewed, instances=part) for skewed in (False, True)
+            ]
+            for part in PARTS
         },
         "limits": ["none" if np.isinf(limit) else f"{limit:g}" for limit in LIMITS],
         "limited": {

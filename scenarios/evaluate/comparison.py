@@ -12,7 +12,16 @@ from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.env.validation import seed_of
 from fleet.errors import FleetError
 from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
-from scenarios.evaluate.scores import Normalised, Shift, SuiteScores, and_trainings, normalised, scores_of
+from scenarios.evaluate.scores import (
+    Normalised,
+    Shift,
+    SuiteScores,
+    and_trainings,
+    groups_of,
+    normalised,
+    scores_of,
+    unit_of,
+)
 from scenarios.evaluate.statistics import HEAD, LEGEND, Figure, Interval, fewest, figure_rows, figures_of, remarks, unit
 from scenarios.evaluate.study import Case, Row, Study, suite_label
 from scenarios.policy_loader import check_name, has_trainings, label, scope_of
@@ -21,6 +30,7 @@ from scenarios.progress import Progress, quiet
 from scenarios.spec.load import scenario_with
 from scenarios.spec.options import RISK, DifficultyName, RiskName
 from scenarios.spec.schema import Scenario
+from scenarios.suite.splits import cell_name
 from scenarios.table import Table
 
 if TYPE_CHECKING:  # slow to import
@@ -61,7 +71,8 @@ class Comparison:
     unit: str
     """What the intervals speak about."""
     draws: int
-    """Independent draws that the intervals rest on: the smallest number of fleets, trainings, seeds or instances."""
+    """Independent draws that the intervals rest on: the smallest number of fleets, trainings and seeds, or of cells (of
+    instances if each is of another cell)."""
     baseline: str
     figures: dict[str, dict[str, Figure]]
     """By policy and name of the figure."""
@@ -80,6 +91,8 @@ class Comparison:
     """Normalised scores; None without references of the shifts."""
     randomise: Randomisation = field(default_factory=Randomisation)
     """Of every shift, the same for every policy."""
+    sources: tuple[str, ...] = ()
+    """Of the predictions."""
     failed_baseline: str = ""
     """The baseline that was asked for, if it failed: another one takes its place."""
 
@@ -219,7 +232,10 @@ def compare(
 
 
 def figures_of_shifts(
-    by_policy: Mapping[str, Sequence[Outcome]], baseline: str, shape: tuple[int, int, int, int] = (1, 1, 1, -1)
+    by_policy: Mapping[str, Sequence[Outcome]],
+    baseline: str,
+    shape: tuple[int, int, int, int] = (1, 1, 1, -1),
+    groups: Array | None = None,
 ) -> dict[str, dict[str, Figure]]:
     """The compared figures of several policies, or of other variants, by its name and that of the figure.
 
@@ -228,6 +244,7 @@ def figures_of_shifts(
         baseline: The one that differences refer to.
         shape: Instances, fleets, trainings and seeds. Of several instances each counts once, by its mean; trainings of
             a policy, which do all instances, are a sample, too.
+        groups: Number of the cell of each instance; None if instances are independent.
     """
 
     def values_of(policy: str, rows: Sequence[Outcome], name: str) -> Array:
@@ -238,7 +255,7 @@ def figures_of_shifts(
         return by_training if has_trainings(policy) else by_training.mean(axis=0, keepdims=True)
 
     values = {policy: {name: values_of(policy, rows, name) for name in FIGURES} for policy, rows in by_policy.items()}
-    return figures_of(values, baseline, KINDS)
+    return figures_of(values, baseline, KINDS, groups)
 
 
 def by_reward(figures: Mapping[str, Mapping[str, Figure]]) -> list[str]:
@@ -298,23 +315,26 @@ def comparison_of(
         for row in own
         if row.error is not None
     ]
-    failed, count = {each.policy for each in failures}, len({row.key.instance for row in rows})
+    failed = {each.policy for each in failures}
+    cells = [cell_name(each) for each in dict.fromkeys(row.key.instance for row in rows)]
+    count, groups = len(cells), groups_of(cells)
     figures, lead, scores = {}, None, None
     if baseline not in failed:
         whole = {each: _repeated(study, own) for each, own in shifts.items() if each not in failed}
-        figures = figures_of_shifts(whole, baseline, (count, *study.shape))
+        figures = figures_of_shifts(whole, baseline, (count, *study.shape), groups)
         best, *others = by_reward(figures)
         if others:
             pair = {name: whole[name] for name in (best, others[0])}
-            lead = figures_of_shifts(pair, others[0], (count, *study.shape))[best]["reward"].to_base
+            lead = figures_of_shifts(pair, others[0], (count, *study.shape), groups)[best]["reward"].to_base
         values = scores_over_all(study, rows, references or {})
         scores = scores_of(values, baseline) if values else None
     fleets, trainings, per_fleet = study.shape
-    several = (count, study.most_trainings) if count > 1 else (fleets if fleets > 1 else trainings, per_fleet)
+    sampled = count if groups is None else len(set(cells))
+    several = (sampled, study.most_trainings) if count > 1 else (fleets if fleets > 1 else trainings, per_fleet)
     return Comparison(
         scenario=name or rows[0].key.instance,
         seeds=tuple(dict.fromkeys(row.key.seed for row in rows)),
-        unit=unit(study.shape) if count == 1 else f"{count} instances{and_trainings(study.most_trainings)}",
+        unit=unit(study.shape) if count == 1 else unit_of(cells) + and_trainings(study.most_trainings),
         draws=fewest(several),
         baseline=baseline,
         figures=figures,
@@ -326,6 +346,7 @@ def comparison_of(
         lead=lead,
         scores=scores,
         randomise=study.randomise or Randomisation(),
+        sources=study.sources,
     )
 
 

@@ -345,7 +345,8 @@ class Board:
         """What a reader must know of the results."""
         scores, base = self.scores, self.entries[self.scores.baseline].card
         remark = (
-            f"{scores.instances} of {self.instances} instances; differences to `{base.policy}` ({base.difficulty})."
+            f"{scores.instances} of {self.instances} instances; differences to `{base.policy}` ({base.difficulty}). "
+            f"Mean score of the hindsight: {scores.reachable}."
         )
         if missing := self.instances - scores.instances:
             remark += f" {missing} have no reference yet and are not scored."

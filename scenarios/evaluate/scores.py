@@ -36,13 +36,16 @@ class Normalised:
     """Cell of each instance; instances of one cell have the same arms, stations and tasks."""
     score: Mapping[str, Array]
     """By policy, [training of the policy, instance]; a single training counts as given, not as a sample."""
+    hindsight: Array
+    """Score of the best schedule that a search found, [instance]; below 1 where the unit is a share of its reward."""
     missing: int = 0
     """Shifts of each policy that have no reference."""
 
     def only(self, chosen: Array) -> "Normalised":
         """Some of the instances, bool [instance]."""
         names, cells = (tuple(np.array(each)[chosen].tolist()) for each in (self.instances, self.cells))
-        return replace(self, instances=names, cells=cells, score={name: x[:, chosen] for name, x in self.score.items()})
+        score = {name: x[:, chosen] for name, x in self.score.items()}
+        return replace(self, instances=names, cells=cells, score=score, hindsight=self.hindsight[chosen])
 
     @cached_property
     def hot(self) -> Array | None:
@@ -53,19 +56,22 @@ class Normalised:
 
     @cached_property
     def groups(self) -> Array | None:
-        """Number of the cell of each instance; None if cells are no sample or each has one instance."""
-        names, groups = np.unique(self.cells, return_inverse=True)
-        return groups if FEWEST_CELLS <= len(names) < len(self.cells) else None
+        """As `groups_of`."""
+        return groups_of(self.cells)
+
+    @property
+    def reachable(self) -> str:
+        """Mean score of the hindsight, in all instances and where heat binds or not."""
+        mean = f"{self.hindsight.mean():.2f}"
+        if self.hot is None:
+            return mean
+        hot, cool = (self.hindsight[part].mean() for part in (self.hot, ~self.hot))
+        return f"{mean} ({hot:.2f} where heat binds, {cool:.2f} where it does not)"
 
     @property
     def unit(self) -> str:
-        """What intervals are about, as `200 instances of 9 cells`."""
-        cells, count = len(set(self.cells)), f"{len(self.instances)} instances"
-        if self.groups is not None:
-            return f"{count} of {cells} cells"
-        if FEWEST_CELLS <= cells == len(self.cells):
-            return count
-        return f"{count}, {f'these {cells} cells' if cells > 1 else 'this cell'} only"
+        """As `unit_of`."""
+        return unit_of(self.cells)
 
     def interval(self, values: Array) -> Interval:
         """The interval of the mean of values [training, instance] over the sample."""
@@ -78,6 +84,22 @@ class Normalised:
     def _sample(self, values: Array) -> Array:
         """As `means.interval` takes them."""
         return values[:, None] if self.groups is None else by_group(values, self.groups)
+
+
+def groups_of(cells: Sequence[str]) -> Array | None:
+    """Number of the cell of each instance, from the cells; None if cells are no sample or each has one instance."""
+    names, groups = np.unique(cells, return_inverse=True)
+    return groups if FEWEST_CELLS <= len(names) < len(cells) else None
+
+
+def unit_of(cells: Sequence[str]) -> str:
+    """What intervals over instances of these cells are about, as `200 instances of 9 cells`."""
+    several, count = len(set(cells)), f"{len(cells)} instances"
+    if groups_of(cells) is not None:
+        return f"{count} of {several} cells"
+    if FEWEST_CELLS <= several == len(cells):
+        return count
+    return f"{count}, {f'these {several} cells' if several > 1 else 'this cell'} only"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,6 +132,8 @@ class SuiteScores:
     unit: str
     """As of `Normalised`."""
     missing: int
+    reachable: str
+    """As of `Normalised`."""
     trainings: int = 1
     """Most trainings of a policy."""
     policies: dict[str, Score]
@@ -118,8 +142,9 @@ class SuiteScores:
     def remarks(self) -> list[str]:
         """What a reader must know of the instances."""
         remarks = [
-            f"Unit: {self.unit}{and_trainings(self.trainings)}. Score: 0 = mean of random, 1 = "
-            "hindsight, the best known schedule; the unit is at least a tenth of its reward."
+            f"Unit: {self.unit}{and_trainings(self.trainings)}. Score: 0 = mean of random, 1 = hindsight, the best "
+            "schedule that a search found, or a tenth of its reward above random if that is more. Mean of the "
+            f"hindsight: {self.reachable}."
         ]
         if self.missing:
             remarks.append(f"Shifts of each policy without a reference, which are not scored: {self.missing}.")
@@ -144,6 +169,7 @@ def scores_of(values: Normalised, baseline: str) -> SuiteScores:
         instances=len(values.instances),
         unit=values.unit,
         missing=values.missing,
+        reachable=values.reachable,
         trainings=max(map(len, values.score.values())),
         policies={
             name: Score(
@@ -249,7 +275,7 @@ def normalised(
     if len(scored) < FEWEST:
         return None
     known = [references[shift] for shift in scored]
-    random, unit = (np.array([getattr(each, name) for each in known]) for name in ("random", "unit"))
+    random, unit, best = (np.array([getattr(each, name) for each in known]) for name in ("random", "unit", "hindsight"))
     score = dict[str, np.ndarray]()
     for policy, rows in by_policy.items():
         rewards: dict[int, dict[Shift, list[float]]] = {}
@@ -265,5 +291,6 @@ def normalised(
         instances=tuple(each.instance for each in known),
         cells=tuple(cell_name(each.instance) for each in known),
         score=score,
+        hindsight=(best - random) / unit,
         missing=len({(row.key.fleet, row.key.instance, row.key.seed) for row in first}) - len(scored),
     )

@@ -536,7 +536,10 @@ class Figure:
 
 
 def figures_of(
-    values: Mapping[str, Mapping[str, Array]], baseline: str, kinds: Mapping[str, FigureKind]
+    values: Mapping[str, Mapping[str, Array]],
+    baseline: str,
+    kinds: Mapping[str, FigureKind],
+    groups: Array | None = None,
 ) -> dict[str, dict[str, Figure]]:
     """The figures of every policy, by policy and name.
 
@@ -544,13 +547,19 @@ def figures_of(
         values: By policy and name of the figure, [seed] or [fleet, training, seed], the same for every policy.
         baseline: The policy that differences refer to.
         kinds: By name of the figure; one that it lacks has any value.
+        groups: As of `aggregates`, of values [training, 1, instance]; None if the last axis has independent values.
     """
+
+    def sample(x: Array) -> Array:
+        return x if groups is None else by_group(x[:, 0], groups)
+
     made = dict[tuple[str, str], tuple[Interval, Interval]]()
     for policy, figures in values.items():
-        for name, x in figures.items():
+        for name, given in figures.items():
+            x, base = sample(given), sample(values[baseline][name])
             kind = kinds.get(name, FigureKind("", least=-math.inf))
             own = count_interval(x) if kind.is_count else interval(x, least=kind.least, most=kind.most)
-            to_base = (paired_counts if kind.is_count else paired)(x, values[baseline][name])
+            to_base = (paired_counts if kind.is_count else paired)(x, base)
             made[policy, name] = own, Interval(0.0, 0.0, 0.0) if policy == baseline else to_base
     adjusted = dict(zip(made, holm([to_base.p for _, to_base in made.values()]).tolist(), strict=True))
 

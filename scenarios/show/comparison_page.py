@@ -170,6 +170,7 @@ def _sections(judged: Judged) -> Iterator[Section]:
             continue
         about = f"{result.scenario}, {result.unit}. Mean and paired difference to {label(result.baseline)}; {LEGEND}."
         settings = f"Channel: {result.channel_text}. Randomisation: {result.randomise.text}."
+        about += f" Predictions: {', '.join(result.sources)}."
         scope, *groups = result.table.split()
         sentences = (f"{about} {settings}", *result.table.notes)
         yield Section(key=key, title=title, sentences=sentences, details=(*groups, scope))
@@ -204,11 +205,11 @@ def verdict(judged: Judged) -> list[str]:
         _against(other, values.difference(best, other), role, len(rest)) for other, role in _rivals(best, rest, base)
     ]
     sentences = [f"{label(best)} {'; it '.join(compared)}."] if compared else []
-    of_all = f"the best of {len(scores.policies)} policies, " if rest else ""
     whose = "Its mean score" if compared else f"The mean score of {label(best)}"
+    among = f", the best of {len(scores.policies)} policies" if rest else ""
     sentences.append(
-        f"{whose} is {scores.policies[best].mean.text()}, {of_all}where 0 is "
-        f"random and 1 the best schedule known for each of {scores.instances} instances."
+        f"{whose} is {scores.policies[best].mean.text()}{among}; random has 0, "
+        f"and the best schedules that a search found for the {scores.instances} instances have {scores.reachable}."
     )
     sentences += _below({name: (each.difference, each.p_holm) for name, each in scores.policies.items()}, base)
     return [*sentences, *([CHOICE] if compared else []), *last]
@@ -235,8 +236,8 @@ def _rivals(best: str, others: Sequence[str], base: str) -> Iterator[tuple[str, 
 
 
 def _against(other: str, difference: Interval, role: str, tests: int) -> str:
-    """`beats the baseline wspt by 0.12 [0.08, 0.16] of the way from random to the best known`."""
-    by = f"{difference.text()} of the way from random to the best known"
+    """`beats the baseline wspt by 0.12 [0.08, 0.16] in mean score`."""
+    by = f"{difference.text()} in mean score"
     if difference.low > 0 and _significant(difference.p, tests):
         return f"beats {role} {label(other)} by {by}"
     among = f", not significant among {tests} policies" if difference.low > 0 else ""

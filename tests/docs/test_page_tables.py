@@ -15,6 +15,7 @@ import pytest
 
 from benchmarks.harness import observed_bytes, step_figures
 from benchmarks.paper.cooling import cooling_tables
+from benchmarks.paper.features import INPUTS, feature_tables
 from benchmarks.result_tables import difference, env_table, steps_table
 from docs.tables import share_of_gain
 from scenarios.evaluate.scores import Normalised
@@ -39,7 +40,7 @@ def test_the_share_of_a_gain_has_fiellers_interval() -> None:
     gain = 1.0 + 0.4 * np.repeat([-1.0, 1.0], 20)
     names = tuple(f"{n}" for n in range(40))
     score = {"blind": blind[None], "rc": gain[None], "oracle": whole[None]}
-    found = share_of_gain(Normalised(names, names, score), "rc")
+    found = share_of_gain(Normalised(names, names, score, np.ones(40)), "rc")
     t2 = 2.0227**2 / 40  # t of 39 degrees of freedom at .975
     (a, b), (_, c) = np.cov(gain, whole)
     p = np.array([2.0**2 - t2 * c, -2.0 * (1.0 * 2.0 - t2 * b), 1.0**2 - t2 * a])
@@ -47,8 +48,16 @@ def test_the_share_of_a_gain_has_fiellers_interval() -> None:
     best, ends = found.split(" ", 1)
     assert best == "0.50"
     assert json.loads(ends) == pytest.approx([low, high], abs=0.006)
-    assert share_of_gain(Normalised(names, names, score), "oracle") == "1"
-    assert share_of_gain(Normalised(names, names, score), "blind") == "0"
+    assert share_of_gain(Normalised(names, names, score, np.ones(40)), "oracle") == "1"
+    assert share_of_gain(Normalised(names, names, score, np.ones(40)), "blind") == "0"
+
+
+def test_an_interval_of_r2_ends_at_one() -> None:
+    rows = [
+        {"estimates": [{"target": "t", "labels": 5, "inputs": each, "r2": r2} for each in INPUTS]}
+        for r2 in (0.5, 0.9, 0.95)
+    ]
+    assert all(cell.endswith(", 1.00]") for cell in cells(feature_tables(rows)["features_r2"].markdown())[0][1:])
 
 
 def test_cooling_has_differences_of_value_to_the_first_way() -> None:

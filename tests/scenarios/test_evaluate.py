@@ -258,10 +258,11 @@ def test_where_heat_binds_has_a_mean_of_its_own():
     levels = {row.axes.heat: (row.name, row.seed) for row in manifest("test")}
     shifts = [levels["cool"], levels["warm"], levels["severe"]]
     known = {shift: Known(shift[0], 0.0, 10.0, 10.0) for shift in shifts}
+    known[shifts[0]] = Known(shifts[0][0], 9.6, 10.0, 10.0)  # less than a tenth of 10 to gain
     blank = Outcome(**dict.fromkeys(FIGURES, 0.0))
     rows = [
         Row(RowKey("a", name, 0, 0, "oracle", seed), replace(blank, reward=reward))
-        for (name, seed), reward in zip(shifts, (9.0, 6.0, 2.0), strict=True)
+        for (name, seed), reward in zip(shifts, (10.5, 6.0, 2.0), strict=True)
     ]
     values = scored({"a": rows}, known)
     assert values is not None
@@ -269,6 +270,8 @@ def test_where_heat_binds_has_a_mean_of_its_own():
     assert found.hot is not None
     assert found.cool is not None
     assert (found.hot.mean, found.cool.mean) == pytest.approx((0.4, 0.9))
+    assert values.reachable == "0.80 (1.00 where heat binds, 0.40 where it does not)"
+    assert f"Mean of the hindsight: {values.reachable}." in scores_of(values, "a").remarks[0]
     other = replace(values, instances=("quickstart/1", *values.instances[1:]))
     assert scores_of(other, "a").policies["a"].hot is None
 
@@ -294,7 +297,7 @@ def test_trainings_of_a_policy_are_a_sample_and_those_of_twins_are_not():
     [("ab", "2 instances, these 2 cells only"), ("aa", "2 instances, this cell only"), ("abc", "3 instances")],
 )
 def test_fewer_than_three_cells_are_no_sample(cells, unit):
-    assert Normalised(instances=tuple("xyz"[: len(cells)]), cells=tuple(cells), score={}).unit == unit
+    assert Normalised(tuple("xyz"[: len(cells)]), tuple(cells), {}, np.ones(len(cells))).unit == unit
 
 
 def test_shifts_without_a_reference_are_counted_and_failures_can_count_as_random():

@@ -17,14 +17,14 @@ from hypothesis import strategies as st
 from joblib import delayed
 
 from fleet.errors import FleetError
-from scenarios.processes import worker_processes
+from scenarios.processes import Call, LocalWorker, worker_processes
 from scenarios.progress import HINTS, Count, StageClock
 from scenarios.result_folder import check_free, new_folder
 from scenarios.run.log import FILES, RUN
 from scenarios.signals import until_stopped
 from scenarios.table import Table
 from scenarios.terminal import Interrupted, SafeConsole, echo, progress_bar
-from tests.waiting import PATIENCE_S, wait_until
+from tests.waiting import PATIENCE_S, PAUSE, wait_until
 
 
 def nested(n: int) -> list[int]:
@@ -68,6 +68,16 @@ def die_once(marker: Path) -> str:
         marker.touch()
         os._exit(1)
     return "done"
+
+
+@pytest.mark.parametrize(("idle_s", "same"), [(3600.0, True), (0.02, False)])
+def test_a_process_that_could_soon_end_gets_no_work(monkeypatch, idle_s, same):
+    worker = LocalWorker()
+    first = worker.submit(Call(0, os.getpid, ())).result(PATIENCE_S)
+    monkeypatch.setattr("scenarios.processes.IDLE_S", idle_s)
+    PAUSE.wait(0.02)
+    assert (worker.submit(Call(1, os.getpid, ())).result(PATIENCE_S) == first) == same
+    worker.close()
 
 
 def test_work_of_a_process_that_died_is_done_again(tmp_path):
