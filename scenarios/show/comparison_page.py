@@ -353,19 +353,21 @@ def spans(
         rows: Name, value, low and high.
         numbers: Of the look of each name.
         title: Of the axis.
-        least: The axis begins here, so that one bad row does not squeeze the others; values below are written.
+        least: The axis begins here, so that one bad row does not squeeze the others; values below are written, and an
+            interval that goes on is marked.
         marked: A name in bold.
     """
     names, values = [name for name, *_ in rows], np.array([row[1:] for row in rows])
     ends = values[np.isfinite(values)]
     low, high = max(least, float(ends.min())), float(ends.max())
     room = 0.04 * (high - low or 1.0)
+    begin = low - room
     labels = [f"<b>{plain(name, NAME)}</b>" if name == marked else plain(name, NAME) for name in names]
     at = np.repeat(np.arange(len(rows))[:, None], 3, axis=1)
     cut = [
-        {"text": f"◂ {value:.2f}", "x": low - room, "y": y, "xanchor": "left", "showarrow": False}
-        for y, value in enumerate(values[:, 0].tolist())
-        if value < low - room
+        {"text": f"◂ {value:.2f}" if value < begin else "◂", "x": begin, "y": y, "xanchor": "left", "showarrow": False}
+        for y, (value, end, _) in enumerate(values.tolist())
+        if min(value, end) < begin
     ]
     looks = [{"marker": {"color": charts.look_of(numbers[name])["color"], "size": 9}} for name in names]
     dots = [_dots(values[[n]], at[[n]], [name], look) for n, (name, look) in enumerate(zip(names, looks, strict=True))]
@@ -374,7 +376,7 @@ def spans(
         "layout": LAYOUT
         | {"height": 12 + ROW_PX * len(rows) + MARGIN["b"], "margin": MARGIN | {"t": 12}}
         | {"annotations": cut, "showlegend": False}
-        | {"xaxis": axis(title, range=[low - room, high + room]), "yaxis": charts.named_rows(labels)},
+        | {"xaxis": axis(title, range=[begin, high + room]), "yaxis": charts.named_rows(labels)},
     }
 
 

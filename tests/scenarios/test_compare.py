@@ -335,13 +335,13 @@ def test_without_references_the_verdict_is_of_rewards(study: Study):
 
 def test_charts_place_points_by_value():
     numbers = {"a": 0, "b": 1, "c": 2}
-    chart = spans([("a", 0.0, -0.5, 0.5), ("b", 1.0, 0.9, 1.1), ("c", -9.0, -9.9, 2.0)], numbers, "score", least=-1.0)
+    chart = spans([("a", 0.0, -0.5, 0.5), ("b", 1.0, -7.0, 1.1), ("c", -9.0, -9.9, 2.0)], numbers, "score", least=-1.0)
     dots = chart["data"]
     assert [(dot["x"], dot["y"]) for dot in dots] == [([0.0], [0]), ([1.0], [1]), ([-9.0], [2])]
     assert [dot["error_x"]["array"][0] for dot in dots] == pytest.approx([0.5, 0.1, 11.0])
-    assert [dot["error_x"]["arrayminus"][0] for dot in dots] == pytest.approx([0.5, 0.1, 0.9])
+    assert [dot["error_x"]["arrayminus"][0] for dot in dots] == pytest.approx([0.5, 8.0, 0.9])
     assert chart["layout"]["xaxis"]["range"][0] > -2.0
-    assert [(note["text"], note["y"]) for note in chart["layout"]["annotations"]] == [("◂ -9.00", 2)]
+    assert [(note["text"], note["y"]) for note in chart["layout"]["annotations"]] == [("◂", 1), ("◂ -9.00", 2)]
     unknown = float("nan")
     rows = [("a", (1.0, 0.5, 2.5), (2.0, unknown, unknown)), ("b", (1.0, 1.0, 1.0), (2.0, 2.0, 2.0))]
     one, two = points(rows, numbers, "x", "y")["data"]
