@@ -294,7 +294,7 @@ def _out_of_range(readings: Mapping[str, Array], degrees: bool) -> Iterator[BadR
         yield from _limited(q, STOPS_RAD, np.rad2deg(q), "°", what, remedy)
     else:
         what = "beyond its stops, ±2.25, ±2.58, ±2.10 rad for joints 2, 4, 6"
-        turned = q.min() >= 0 and (np.abs(_half_turn(q)) <= STOPS_RAD).all()
+        turned = q.min() >= 0 and (np.abs(half_turn(q)) <= STOPS_RAD).all()
         remedy = "Are these degrees?" if np.abs(q).max() > 2 * np.pi else ""
         remedy = "Do the angles run from 0 to 2π? Give them from −π to π." if turned and not remedy else remedy
         yield from _limited(q, STOPS_RAD, q, " rad", what, remedy)
@@ -409,10 +409,10 @@ def _impossible_changes(time_s: Array, temp_c: Array) -> Iterator[BadReading]:
 
 def _steps(q: Array) -> Array:
     """Change of the angles by at most half a turn, rad, [row − 1, joint]."""
-    return _half_turn(np.diff(q, axis=0))
+    return half_turn(np.diff(q, axis=0))
 
 
-def _half_turn(angle: Array) -> Array:
+def half_turn(angle: Array) -> Array:
     """Angles within half a turn of zero, rad."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 

@@ -24,7 +24,7 @@ from fleet.live.arm.body import MotionMonitor
 from fleet.live.arm.node import WARNING_S, ClockSync, RateLimitedWarnings
 from fleet.live.clock import FleetClock
 from fleet.live.monitor.snapshot import Recent
-from fleet.readings import TemperatureFilter
+from fleet.readings import TemperatureFilter, half_turn
 from fleet.robot import ThermalLimits
 from fleet.ros2.cdr import (
     DIAGNOSTICS,
@@ -219,7 +219,7 @@ def _fastest(recent: Sequence[tuple[Joints, float]]) -> float:
     stamps = np.array([joints.time_s for joints, _ in recent])
     at_s = stamps if (np.diff(stamps) > 0).all() else np.array([real_s for _, real_s in recent])
     q = np.array([joints.q for joints, _ in recent])
-    q = (q - q[0] + np.pi) % (2 * np.pi) - np.pi  # a joint without stops may be written in any turn
+    q = half_turn(q - q[0])  # a joint without stops may be written in any turn
     half = len(q) // 2
     apart_s = max(at_s[-half:].mean() - at_s[:half].mean(), WINDOW_S / 2)
     return float(np.abs(q[-half:].mean(axis=0) - q[:half].mean(axis=0)).max() / apart_s)

@@ -1,5 +1,6 @@
 """Commands that steer a live fleet: `thermofleet job` and `thermofleet arm pause | reset | clear`."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import typer
@@ -68,13 +69,13 @@ def submit_command(
         raise FleetError("--json is for --quote: leave it out.")
     from scenarios.live.requests import job_of, places_of_cell, quote_jobs, read_jobs, submit_jobs
     from scenarios.show.words import clock
-    from scenarios.spec.job_table import SUFFIXES
+    from scenarios.spec.job_table import SUFFIXES, check_places
 
     table = file if file.lower().endswith(SUFFIXES) else ""
     if file:
         jobs = read_jobs(file, shift_begin)
         if table and not quote and (places := places_of_cell(endpoint, fleet)):  # waits for a router
-            jobs = read_jobs(file, shift_begin, places)
+            check_places(jobs, places, str(Path(file)))
         first_s = min((job.release_s for job in jobs.values()), default=0.0)
         if first_s > 0 and not shift_begin:
             say(f"Times count from fleet time 0: the first job is released at {clock(first_s)}. See --shift-begin.")

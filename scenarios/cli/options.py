@@ -325,8 +325,8 @@ def recordings_of(
     from twin.logs.reader import read, read_folder
 
     damaged = "skip" if skip_damaged else "refuse"
-    with explain_damage(), nullcontext(progress) if progress else progress_bar(kept="") as told:
-        told("reading the log", 0.0)
+    with explain_damage(), nullcontext(progress) if progress else progress_bar(kept="") as report:
+        report("reading the log", 0.0)
         return read_folder(log, damaged=damaged) if log.is_dir() else read(log, damaged=damaged, measured=measured)
 
 

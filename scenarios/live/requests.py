@@ -158,21 +158,20 @@ def places_of_cell(endpoint: str, fleet: str) -> list[str] | None:
     return None
 
 
-def read_jobs(file: str, begin: str = "", places: Sequence[str] | None = None) -> dict[int, JobSpec]:
+def read_jobs(file: str, begin: str = "") -> dict[int, JobSpec]:
     """Read the jobs of a file of JSON, or of standard input for `-`, or of a job table by its suffix.
 
     They are numbered by the lines or rows of the file, or by their places in a list.
 
     Args:
         begin: Date, time and zone of fleet time 0, for the dates in a job table.
-        places: Of the cell, for those in a job table; None: not checked.
 
     Raises:
         FleetError: a job is invalid; names the line, or the index in the list. Of a job table all faults are named.
     """
     shift = shift_begin(begin, "--shift-begin")
     if file.lower().endswith(SUFFIXES):
-        return read_job_table(Path(file), begin=shift, places=places)
+        return read_job_table(Path(file), begin=shift)
     if shift:
         raise FleetError(f"--shift-begin is for a job table, a file that ends in {', '.join(SUFFIXES)} (got {file}).")
     name = "standard input" if file == "-" else file

@@ -197,7 +197,8 @@ def verdict(judged: Judged) -> list[str]:
     last = [f"Failed: {', '.join(sorted(map(label, failed)))}; a policy with a failed shift has no figures."] * bool(
         failed
     )
-    last += [each for each in [_replaced_baseline(judged.results[0])] if each]
+    if replaced := _replaced_baseline(judged.results[0]):
+        last.append(replaced)
     if values is None or scores is None:
         return [*_reward_verdict(judged.results), *([CHOICE] if len(judged.results[0].figures) > 1 else []), *last]
     best, *rest = ranked(scores)

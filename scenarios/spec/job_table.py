@@ -337,7 +337,7 @@ def read_job_table(
         raise ScenarioError(f"{where} has {len(head)} columns; a job table has at most {MOST_COLUMNS}.")
     columns, dialect = _read_head(head_row, head, faults), _Dialect(begin, decimal_comma, horizon_s, is_sheet)
     faults.raise_any(where)
-    no_place = cache(lambda name: f"no place '{printable(name)}'{nearest(name, places or ())}")
+    no_place = _no_place(places or ())
     rows: dict[str, tuple[int, Row]] = {}
     for count, (number, cells) in enumerate(lines):
         if count == MOST_ROWS:
@@ -368,6 +368,26 @@ def read_job_table(
     if not jobs:
         raise ScenarioError(f"{where} has no jobs; give a row of headings, then one row for each job.")
     return jobs
+
+
+def check_places(jobs: Mapping[int, JobSpec], places: Collection[str], where: str) -> None:
+    """Check the places of a table that was read without them; raises a ScenarioError with all faults.
+
+    Args:
+        jobs: By the numbers of their rows.
+        where: As in `read_job_table`, as are `places`.
+    """
+    faults, no_place = _Faults(), _no_place(places)
+    for number, job in jobs.items():
+        for name in dict.fromkeys(chain.from_iterable(job.every_places)):
+            if name not in places:
+                faults.add(number, "places", no_place(name))
+    faults.raise_any(where)
+
+
+def _no_place(places: Collection[str]) -> Callable[[str], str]:
+    """The fault of a place that a cell does not have, by its name."""
+    return cache(lambda name: f"no place '{printable(name)}'{nearest(name, places)}")
 
 
 def _read_head(number: int, head: Sequence[Cell], faults: _Faults) -> dict[int, tuple[str, float]]:

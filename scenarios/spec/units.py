@@ -37,9 +37,7 @@ _MISTAKES: Mapping[str, _Mistake] = {
     "clearance_m": _Mistake("millimetres", 0.5, 20_000.0),
 }
 """By key, at any depth of a file."""
-_FAHRENHEIT: Mapping[str, _Mistake] = {
-    **dict.fromkeys(("warning_c", "error_c", "restart_c"), _Mistake("°F", 110.0, 263.0)),
-}
+_FAHRENHEIT = {each: _Mistake("°F", 110.0, 263.0) for each in ("warning_c", "error_c", "restart_c")}
 """Of limits of motors, which stop at 75 °C."""
 _MEANT: Mapping[str, Callable[[float], str]] = {
     "°F": lambda f: f"{f:g} °F is {(f - 32) / 1.8:.1f} °C. Give °C.",

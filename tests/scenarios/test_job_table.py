@@ -301,8 +301,8 @@ def test_a_time_of_day_that_summer_time_leaves_out_is_told(tmp_path):
         if exists:
             assert drawn(small_table(tmp_path, text, begin), 0)[0].release_s == 60.0
         else:
-            told = faults_of(tmp_path, text, begin)
-            assert f"column release: '{release}' does not exist: summer time leaves out this hour" in told
+            faults = faults_of(tmp_path, text, begin)
+            assert f"column release: '{release}' does not exist: summer time leaves out this hour" in faults
 
 
 def test_only_plain_numbers_are_scaled_to_the_unit_of_a_heading(tmp_path):

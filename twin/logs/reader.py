@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 
 from fleet.errors import LogError, nearest
 from fleet.files import decode_text
-from fleet.readings import clock_step, judge, judge_plan, mounts_differ, repeats
+from fleet.readings import clock_step, half_turn, judge, judge_plan, mounts_differ, repeats
 from fleet.robot import JOINTS
 from twin.logs.recording import GAP_S, READINGS, Recording
 
@@ -425,7 +425,7 @@ def channels(layout: Format, groups: Sequence[str], table: LogTable) -> dict[str
             columns = [table.names.index(column) for column in layout.columns(group)]
             readings[channel] = table.values[:, columns] * factor
     if layout.turns:
-        readings["q"] = (readings["q"] + np.pi) % (2 * np.pi) - np.pi
+        readings["q"] = half_turn(readings["q"])
     return readings
 
 

@@ -19,6 +19,7 @@ from fleet.errors import FleetError
 from fleet.heat.motor import Motors, magnet_factor
 from fleet.heat.thermal import HOUSING, WINDING, temperature_steps
 from fleet.motion import Drive
+from fleet.readings import half_turn
 from fleet.robot import JOINTS
 from twin.logs.recording import (
     HEAT_GAP_S,
@@ -234,7 +235,7 @@ def forecast(
         ambient_c=ambient_c,
         residual_k=np.sqrt(np.mean(problem.unexplained(likely)[0] ** 2, axis=0)),
         distance_sd=float((np.abs(likely - vector.mean) / np.hypot(vector.sd, FROM_LOG_TO_LOG)).max()),
-        way_back_rad=float(np.abs((plan.q[-1] - plan.q[0] + np.pi) % (2 * np.pi) - np.pi).max()),
+        way_back_rad=float(np.abs(half_turn(plan.q[-1] - plan.q[0])).max()),
     )
 
 
