@@ -12,7 +12,11 @@ function makeActions(gateway, fleet) {
   function answer(text, failed) {
     const place = element("answer");
     clearTimeout(hide);
-    if (!failed) hide = setTimeout(() => { place.hidden = true; }, 20000);
+    const end = () => {
+      if (isPressed()) hide = setTimeout(end, 500);
+      else place.hidden = true;
+    };
+    if (!failed) hide = setTimeout(end, 20000);
     place.hidden = false;
     setClass(place, failed ? "status bad" : "status good");
     setText(place, `${failed ? "✖" : "✔"} ${text}`);

@@ -383,7 +383,7 @@ function startPage() {
       lastDraw = ms;
       drawCell();
     }
-    if (dirty && ms - lastTables >= TABLES_MS) {
+    if (dirty && ms - lastTables >= TABLES_MS && !isPressed()) {
       lastTables = ms;
       drawTables();
     }

@@ -10,6 +10,13 @@ function make(tag, attributes, ...children) {
   return made;
 }
 
+// Whether a button of the mouse or a finger is down: what moves away under it would take the click.
+const MOST_PRESS_MS = 2000;
+let pressedMs = -Infinity;
+addEventListener("pointerdown", () => { pressedMs = performance.now(); }, true);
+for (const end of ["pointerup", "pointercancel"]) addEventListener(end, () => { pressedMs = -Infinity; }, true);
+const isPressed = () => performance.now() - pressedMs < MOST_PRESS_MS;
+
 function setText(node, text) {
   const shown = visible(text);
   if (node.textContent !== shown) node.textContent = shown;

@@ -227,6 +227,20 @@ def test_the_journal_has_sentences_with_names_in_order_of_time(served, fleet, op
     ]
 
 
+def test_a_press_ends_on_the_button_on_which_it_began(served, fleet, open_page):
+    fleet.paused["*"] = "ann"
+    fleet.post(lambda: fleet.set("crate", state="waiting"))
+    page = open_page(served)
+    page.get_by_role("button", name="Cancel crate").hover()
+    page.mouse.down()
+    for number in range(6):  # listed above it
+        fleet.post(lambda number=number: fleet.set(f"lost {number}", state="unfinished"))
+    page.wait_for_timeout(1500)
+    page.mouse.up()
+    expect(page.locator("#confirm-title")).to_have_text("Cancel crate?")
+    expect(page.locator("#jobs tbody tr")).to_have_count(7)
+
+
 @pytest.mark.ci_slow
 def test_the_keyboard_is_enough(served, fleet, open_page):
     page = open_page(served)
