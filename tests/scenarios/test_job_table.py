@@ -305,6 +305,25 @@ def test_a_time_of_day_that_summer_time_leaves_out_is_told(tmp_path):
             assert f"column release: '{release}' does not exist: summer time leaves out this hour" in faults
 
 
+def test_a_time_of_day_that_occurs_twice_is_told(tmp_path, caplog):
+    for shift_begin, release, told in (
+        ("2026-10-25T01:59:00", "2:00", True),
+        ("2026-10-25T01:59:00", "2026-10-25T02:00", True),
+        ("2026-10-25T01:59:00", "2026-10-25T02:00+02:00", False),
+        ("2026-10-25T02:29:00+01:00", "2:30", False),  # begins between both
+    ):
+        caplog.clear()
+        begin, text = (
+            f'time_zone = "Europe/Berlin"\nshift_begin = {shift_begin}',
+            f"{SHORT}\na,hold,bench,,,{release},,,,\n",
+        )
+        assert drawn(small_table(tmp_path, text, begin), 0)[0].release_s == 60.0
+        sentence = f"row 2, column release: '{release}' occurs twice, as summer time ends: 2026-10-25T02:00+02:00 is"
+        assert (sentence in caplog.text) == told
+    small_table(tmp_path, f"{SHORT}\na,hold,bench,,,,,,,\n", begin.removesuffix("+01:00"))
+    assert "shift_begin = 2026-10-25 02:29:00 occurs twice, as summer time ends" in caplog.text
+
+
 def test_only_plain_numbers_are_scaled_to_the_unit_of_a_heading(tmp_path):
     text = "name,kind,places,release_min,due_min\na,hold,bench,1,6:02\nb,hold,bench,0,2026-11-23T06:02:30+01:00\n"
     jobs = drawn(small_table(tmp_path, text, "shift_begin = 2026-11-23T06:00:00+01:00"), 0)
