@@ -2,7 +2,9 @@
 
 import csv
 import io
+import re
 import time
+import tomllib
 from datetime import UTC, datetime, timedelta, timezone
 from datetime import time as clock
 from pathlib import Path
@@ -25,7 +27,7 @@ from scenarios.run.shift import run
 from scenarios.spec.job_table import read_job_table
 from scenarios.spec.jobs import draw_jobs
 from scenarios.spec.load import library, load
-from scenarios.spec.parse import scenario_hash
+from scenarios.spec.parse import parse_scenario, scenario_hash
 from scenarios.spec.schema import Scenario
 from tests.scenarios.conftest import SMALL
 
@@ -445,6 +447,24 @@ def test_a_thousand_rows_are_read_and_all_their_faults_told_soon(tmp_path):
     began_s = time.process_time()
     assert len(small_table(tmp_path, "\n".join([SHORT, *rows])).jobs) == 1000
     assert time.process_time() - began_s < SOON_S
+
+
+def test_jobs_that_cannot_finish_in_time_are_told(tmp_path, caplog, plans):
+    table = small_table(tmp_path, f"{SHORT}\na,hold,bench,,,,1,,,\nb,hold,bench,,,,1,yes,,\nc,hold,bench,,,179,,,,\n")
+    raw = tomllib.loads(SMALL) | {"name": "heat", "horizon_s": 10}
+    raw["jobs"][1]["due_s"] = 0.5
+    for scenario in (table, parse_scenario(raw, tmp_path)):
+        prepare(scenario, difficulty="blind", cache=plans)
+    assert [re.sub(r"[\d.]+ s \(", "… s (", each.message) for each in caplog.records] == [
+        "cell.toml: 'jobs.csv', row 2, column due: 'a' takes at least … s (1 cycle), but has 1 s until it is due. Are "
+        "its times minutes? Give seconds.",
+        "cell.toml: 'jobs.csv', row 4, column release: 'c' takes at least … s (1 cycle), but has 1 s until the shift "
+        "ends. Are its times minutes? Give seconds.",
+        "heat.toml: horizon_s: 'hold' takes at least … s (1 cycle), but has 10 s until the shift ends. Are its times "
+        "minutes? Give seconds.",
+        "heat.toml: jobs[1].due_s: 'sort' takes at least … s (1 cycle), but has 0.5 s until it is due. Are its times "
+        "minutes? Give seconds.",
+    ]
 
 
 def test_rows_outside_the_shift_are_counted_and_a_name_of_a_streams_job_is_refused(tmp_path, caplog, plans):
