@@ -1,8 +1,9 @@
 """From a scenario to a fleet of arms with plans and twins, and to its environment, single or batched."""
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +34,7 @@ from scenarios.prepare.shipped import is_shipped
 from scenarios.prepare.surprise import arms_with_surprises
 from scenarios.progress import Count, Progress, check_progress, quiet
 from scenarios.spec.calendar import absences_of
-from scenarios.spec.jobs import JobSampler, all_works, kinds_of, rehearsal_works, weights_of
+from scenarios.spec.jobs import JobSampler, all_works, kinds_of, rehearsal_works, weights_of, works_of
 from scenarios.spec.load import scenario_with
 from scenarios.spec.options import RISK, BusName, DifficultyName, PlantName, RiskName
 from scenarios.spec.parse import choose
@@ -42,6 +43,8 @@ from scenarios.spec.schema import Scenario
 if TYPE_CHECKING:
     from fleet.engine.shift import Episode, Plant
     from fleet.env.allocation_v2 import AllocationEnv, MaskPlace
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +115,11 @@ def prepare(
         space = made.space if made else space_of(spec, robots, plans, _folder(cache), share)
         refused = tuple(error for arm in planned for error in arm.infeasible)
         fleets.append(Fleet(spec, tuple(arms), refused, space, planned=tuple(planned)))
+    late = list(late_jobs(specs[0], fleets[0].planned))
+    for sentence in late[:REASONS]:
+        _LOG.warning("%s", sentence)
+    if len(late) > REASONS:
+        _LOG.warning("%s.toml: %d more jobs cannot finish in time.", specs[0].name, len(late) - REASONS)
     return replace(fleets[0], randomise=randomise, variants=tuple(fleets[1:]))
 
 
@@ -201,6 +209,31 @@ def cell_problems(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) 
                 f"{more}); move the arm or the places, give it jobs, or leave it out."
             )
     return problems
+
+
+def late_jobs(scenario: Scenario, arms: Sequence[PlannedArm]) -> Iterator[str]:
+    """A sentence for each stream whose jobs cannot finish before they are due, or in the shift."""
+
+    @cache
+    def least_s(works: tuple[Work, ...], cycles: int) -> float:
+        plans = (plan for arm in arms for work in works for plan in arm.plans.get(work, ()))
+        return min((plan.approach.duration_s + cycles * plan.cycle.duration_s for plan in plans), default=0.0)
+
+    for i, stream in enumerate(scenario.jobs):
+        cycles, spec = stream.repetitions[0], stream.arrivals
+        left_s = scenario.horizon_s - spec.start_s - min(spec.times_s or (0.0,))
+        place, until = stream.place_of(i, "release") if stream.row else "horizon_s", "the shift ends"
+        if stream.due == "soft" and stream.due_s < left_s:  # a hard job must only begin before it is due
+            left_s, place, until = stream.due_s, stream.place_of(i, "due" if stream.row else "due_s"), "it is due"
+        needed_s = least_s(works_of(scenario, stream), cycles)
+        if left_s < 0 or needed_s <= left_s:
+            continue
+        unit = next((name for name, s in (("minutes", 60.0), ("hours", 3600.0)) if s * left_s >= needed_s), "")
+        yield (
+            f"{scenario.name}.toml: {place}: '{stream.name}' takes at least {needed_s:.4g} s ({cycles} "
+            f"cycle{'s' * (cycles > 1)}), but has {left_s:.4g} s until {until}."
+            f"{unit and f' Are its times {unit}? Give seconds.'}"
+        )
 
 
 def _blind_arm(planned: PlannedArm, works: Sequence[Work], folder: Path) -> Arm:

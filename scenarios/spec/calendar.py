@@ -5,9 +5,11 @@ shift, or as dates; with `shift_begin`, `h:mm` is a time of day. With `weekdays`
 arrivals of kind `weekly`. They become plain times here, so the rest of the product knows no calendar.
 """
 
+import logging
 import re
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, time, timedelta, tzinfo
+from functools import partial
 from math import ceil, inf
 from typing import Any
 from zoneinfo import ZoneInfo
@@ -17,9 +19,10 @@ import numpy as np
 from fleet.engine.state import ABSENCE, BROKEN, FINISH_CYCLE, FINISH_JOB, no_absences
 from fleet.errors import ScenarioError, nearest, printable
 from fleet.seeding import child
-from scenarios.spec.job_table import DAY_S, seconds_of, since
+from scenarios.spec.job_table import DAY_S, counts_as, seconds_of, since, twice
 from scenarios.spec.schema import MOST_BREAKS, Scenario
 
+_LOG = logging.getLogger(__name__)
 WEEKDAYS = ("monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday")
 DAY, LONGEST_NIGHT = timedelta(days=1), timedelta(hours=12)
 """The end of a day, and the longest break beyond it: a longer one has its begin and end exchanged."""
@@ -107,7 +110,8 @@ def _break_times(
     daily = begin is not None and all(_is_clock(given[name]) for name in ("begin", "end"))
     if "weekdays" not in given and not daily:
         try:
-            first_s, last_s = (seconds_of(given[name], begin, horizon_s) for name in ("begin", "end"))
+            tell = partial(_LOG.warning, "%s: %s.", where)
+            first_s, last_s = (seconds_of(given[name], begin, horizon_s, tell) for name in ("begin", "end"))
         except ValueError as error:
             raise ScenarioError(f"{where}: {error}.") from error
         yield entry | {"begin_s": first_s, "end_s": last_s}
@@ -118,7 +122,7 @@ def _break_times(
     if next_day and (not timedelta() < last - first < DAY or (last - first > LONGEST_NIGHT and last != DAY)):
         raise ScenarioError(f"{where}: it ends at {given['end']}, before it begins at {given['begin']}.")
     found, touched = list[dict[str, Any]](), False
-    for day_s, date in _days(given.get("weekdays", list(WEEKDAYS)), begin, horizon_s, f"{where}.weekdays"):
+    for day_s, date in _days(given.get("weekdays", list(WEEKDAYS)), begin, horizon_s, where):
         begin_s, end_s = day_s(date, first), day_s(date, last)
         touched |= end_s > 0 and begin_s < horizon_s
         if end_s > max(0.0, begin_s) and begin_s < horizon_s:  # not within the hour that summer time leaves out
@@ -142,7 +146,7 @@ def _recurring(stream: Any, begin: datetime | None, horizon_s: float, where: str
     if not isinstance(times := arrivals.get("at"), list) or not times:
         raise ScenarioError(f'{where}.at must be a list of times of day, as ["6:00", "14:30"] (got {times!r}).')
     clocks = [_clock(each, f"{where}.at") for each in times]
-    days = _days(arrivals.get("weekdays", list(WEEKDAYS)), begin, horizon_s, f"{where}.weekdays")
+    days = _days(arrivals.get("weekdays", list(WEEKDAYS)), begin, horizon_s, where)
     found = sorted({day_s(date, each) for day_s, date in days for each in clocks})
     inside = [time_s for time_s in found if 0 <= time_s < horizon_s]
     if not inside:
@@ -153,18 +157,26 @@ def _recurring(stream: Any, begin: datetime | None, horizon_s: float, where: str
 def _days(given: object, begin: datetime | None, horizon_s: float, where: str) -> Iterator[tuple[Any, datetime]]:
     """Midnight of each of the weekdays that may touch the shift, and a function of it and a time of day.
 
-    The function gives seconds since the begin of the shift; a clock that is set in between counts.
+    The function gives seconds since the begin of the shift; a clock that is set in between counts. It logs a warning
+    for a time in the shift that occurs twice or never.
     """
+    place = f"{where}.weekdays"
     if begin is None:
-        raise ScenarioError(f"{where}: weekdays need shift_begin, the begin of the shift.")
+        raise ScenarioError(f"{place}: weekdays need shift_begin, the begin of the shift.")
     if not isinstance(given, list) or not given:
-        raise ScenarioError(f"{where} must be a list of days, as {list(WEEKDAYS[:2])} (got {given!r}).")
+        raise ScenarioError(f"{place} must be a list of days, as {list(WEEKDAYS[:2])} (got {given!r}).")
     for name in given:
         if name not in WEEKDAYS:
-            raise ScenarioError(f"{where}: there is no day '{printable(str(name))}'{nearest(str(name), WEEKDAYS)}")
+            raise ScenarioError(f"{place}: there is no day '{printable(str(name))}'{nearest(str(name), WEEKDAYS)}")
 
     def since_begin(date: datetime, clock: timedelta) -> float:
-        return since(begin, (date + clock).replace(tzinfo=begin.tzinfo))
+        moment = (date + clock).replace(tzinfo=begin.tzinfo)
+        time_s, counted, doubt = since(begin, moment), counts_as(moment), twice(moment)
+        if counted != date + clock:
+            doubt = f"does not exist: summer time leaves out this hour, so it counts as {counted:%H:%M}"
+        if doubt and 0 <= time_s < horizon_s:
+            _LOG.warning("%s: %s %s.", where, f"{moment:%d %b %Y %H:%M}", doubt)
+        return time_s
 
     for day in range(-1, ceil(horizon_s / DAY_S) + 1):
         date = datetime.combine(begin.date() + timedelta(days=day), time())

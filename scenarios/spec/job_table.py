@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, date, datetime, time, timedelta, tzinfo
 from difflib import get_close_matches
-from functools import cache
+from functools import cache, partial
 from graphlib import CycleError, TopologicalSorter
 from importlib import import_module
 from itertools import chain, islice
@@ -82,6 +82,8 @@ class _Dialect(NamedTuple):
     """Whether a number below 1 may be a time of day, as in a sheet."""
     factor: float = 1.0
     """Of a plain number, to s or kg."""
+    tell: Callable[[str], None] = _LOG.warning
+    """Called with a sentence on a time that occurs twice."""
 
 
 def _number(cell: Cell, dialect: _Dialect) -> float:
@@ -115,7 +117,7 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
     if clock := _CLOCK.fullmatch(text):
         hours, minutes, seconds = (float((part or "0").replace(",", ".")) for part in clock.groups())
         given_s = 3600 * hours + 60 * minutes + seconds
-        return given_s if begin is None else _clock_seconds(text, given_s, begin, dialect.horizon_s)
+        return given_s if begin is None else _clock_seconds(text, given_s, begin, dialect)
     if isinstance(cell, str) and (dotted := _DOTTED_CLOCK.fullmatch(text)):
         number = f"{float(text.replace(',', '.')):.3f}"
         raise ValueError(f"is this {dotted[1]}:{dotted[2]}? Give times as h:mm, or a number as {number}")
@@ -124,7 +126,7 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
     try:
         number = _number(cell, dialect)
     except ValueError:
-        return _date_seconds(text, cell, begin)
+        return _date_seconds(text, cell, begin, dialect.tell)
     if begin is not None and (moment := _of_sheet(number, begin, dialect.horizon_s)):
         raise ValueError(
             f"is this {moment:%d %b %Y %H:%M}, in days as a spreadsheet counts? Give a date with time, as "
@@ -133,22 +135,21 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
     return number
 
 
-def _clock_seconds(text: str, given_s: float, begin: datetime, horizon_s: float) -> float:
+def _clock_seconds(text: str, given_s: float, begin: datetime, dialect: _Dialect) -> float:
     """From the begin of the shift to the next time of day, given in seconds by the clock since midnight, s."""
     if given_s > DAY_S:
         raise ValueError(f"with shift_begin, h:mm is a time of day, up to 24:00 (got '{text}')")
     midnight = begin.replace(hour=0, minute=0, second=0, microsecond=0)
     today, tomorrow = (midnight + timedelta(days=days, seconds=given_s) for days in (0, 1))
-    moment = today if since(begin, today) >= 0 else tomorrow
-    if moment == tomorrow and since(begin, tomorrow) > horizon_s:
+    moment = today if max(since(begin, today.replace(fold=fold)) for fold in (0, 1)) >= 0 else tomorrow
+    if moment == tomorrow and since(begin, tomorrow) > dialect.horizon_s:
         raise ValueError(
             f"'{text}' is outside the shift, which begins at {begin:%H:%M} and ends before {text} of the next day"
         )
-    check_exists(moment, f"'{text}'")
-    return since(begin, moment)
+    return _local_seconds(moment, f"'{text}'", begin, dialect.tell)
 
 
-def _date_seconds(text: str, cell: Cell, begin: datetime | None) -> float:
+def _date_seconds(text: str, cell: Cell, begin: datetime | None, tell: Callable[[str], None]) -> float:
     """From the begin of the shift to a date with time, s; without a zone it has that of the begin."""
     if german := _GERMAN_DATE.fullmatch(text):
         day, month, year, clock_time = german.groups()
@@ -164,8 +165,17 @@ def _date_seconds(text: str, cell: Cell, begin: datetime | None) -> float:
     if not YEARS[0] <= moment.year <= YEARS[1]:
         raise ValueError(f"expected a year from {YEARS[0]} to {YEARS[1]} (got {moment.year})")
     if moment.tzinfo is None:
-        moment = moment.replace(tzinfo=begin.tzinfo)
-        check_exists(moment, _shown(cell))
+        return _local_seconds(moment.replace(tzinfo=begin.tzinfo), _shown(cell), begin, tell)
+    return since(begin, moment)
+
+
+def _local_seconds(moment: datetime, given: str, begin: datetime, tell: Callable[[str], None]) -> float:
+    """From the begin of the shift to a time of the clock, s; if it occurs twice, to the first one in the shift."""
+    check_exists(moment, given)
+    if since(begin, moment) < 0:
+        return since(begin, moment.replace(fold=1))
+    if sentence := twice(moment):
+        tell(f"{given} {sentence}")
     return since(begin, moment)
 
 
@@ -179,8 +189,19 @@ def _of_sheet(days: float, begin: datetime, horizon_s: float) -> datetime | None
 
 def check_exists(moment: datetime, given: str) -> None:
     """Raise a ValueError for a time of day that a clock put forward for summer time leaves out."""
-    if moment.astimezone(UTC).astimezone(moment.tzinfo).replace(tzinfo=None) != moment.replace(tzinfo=None):
+    if counts_as(moment) != moment.replace(tzinfo=None):
         raise ValueError(f"{given} does not exist: summer time leaves out this hour. Give another time")
+
+
+def counts_as(moment: datetime) -> datetime:
+    """The time of the clock at this moment, without a zone: another one if a clock put forward leaves it out."""
+    return moment.astimezone(UTC).astimezone(moment.tzinfo).replace(tzinfo=None)
+
+
+def twice(moment: datetime) -> str:
+    """Which moment is taken of a time of day that occurs twice, as it follows its time; "" for others that exist."""
+    first, second = (moment.replace(fold=fold).isoformat(timespec="minutes") for fold in (0, 1))
+    return "" if first == second else f"occurs twice, as summer time ends: {first} is taken, not {second}"
 
 
 def _job_time(cell: Cell, dialect: _Dialect) -> float:
@@ -197,17 +218,18 @@ def since(begin: datetime, date: datetime) -> float:
     return (date.astimezone(UTC) - begin.astimezone(UTC)).total_seconds()
 
 
-def seconds_of(given: object, begin: datetime | None, horizon_s: float) -> float:
+def seconds_of(given: object, begin: datetime | None, horizon_s: float, tell: Callable[[str], None]) -> float:
     """Time from the begin of the shift, s, as a cell of a table may give it.
 
     Args:
         begin: Of the shift; None for unknown.
         horizon_s: Length of the shift.
+        tell: Called with a sentence on a time that occurs twice.
 
     Raises:
         ValueError: it is no time.
     """
-    return _seconds(given, _Dialect(begin, False, horizon_s, False))
+    return _seconds(given, _Dialect(begin, False, horizon_s, False, tell=tell))
 
 
 def _names(cell: Cell, _: object) -> tuple[str, ...]:
@@ -292,17 +314,22 @@ class _Faults(dict[tuple[str, str], list[int]]):
     def add(self, row: int, column: str, sentence: str) -> None:
         self.setdefault((column, sentence.rstrip(".")), []).append(row)
 
-    def raise_any(self, where: str) -> None:
-        """Raise a ScenarioError with all faults, if there are any."""
-        if not self:
-            return
-        total, lines = sum(map(len, self.values())), list[str]()
+    def lines(self) -> list[str]:
+        """A sentence for each kind of fault, with its rows and column."""
+        lines = list[str]()
         for (column, sentence), rows in islice(self.items(), MOST_FAULTS):
             more = f" and {len(rows) - MOST_NUMBERS} more" if len(rows) > MOST_NUMBERS else ""
             numbers = f"row{'s' * (len(rows) > 1)} {', '.join(map(str, rows[:MOST_NUMBERS]))}{more}"
             lines.append(f"  {numbers}{f', column {column}' if column else ''}: {sentence}.")
         if len(self) > MOST_FAULTS:
             lines.append(f"  … and {len(self) - MOST_FAULTS} more kinds of faults.")
+        return lines
+
+    def raise_any(self, where: str) -> None:
+        """Raise a ScenarioError with all faults, if there are any."""
+        if not self:
+            return
+        total, lines = sum(map(len, self.values())), self.lines()
         raise ScenarioError("\n".join([f"{where} has {total} fault{'s' * (total > 1)}:", *lines]))
 
 
@@ -329,7 +356,7 @@ def read_job_table(
         ScenarioError: the file cannot be read, or rows are wrong: all faults, each with its row and column.
         MissingExtra: the library for an XLSX file is not installed.
     """
-    where, faults, jobs = where or str(file), _Faults(), dict[int, JobSpec]()
+    where, faults, doubts, jobs = where or str(file), _Faults(), _Faults(), dict[int, JobSpec]()
     lines, decimal_comma = _rows(file, where)
     is_sheet = isinstance(file, Path) and file.suffix.lower() == ".xlsx"
     head_row, head = next(lines, (1, ()))
@@ -345,7 +372,7 @@ def read_job_table(
         if len(cells) > len(head) and not all(map(_is_empty, cells[len(head) :])):
             faults.add(number, "", f"{len(cells)} cells, but the head has {len(head)}; quote cells with separators")
             continue
-        row, wrong = _read_row(number, cells, columns, dialect, faults)
+        row, wrong = _read_row(number, cells, columns, dialect, faults, doubts)
         for field, sentence in _problems(row, wrong):
             faults.add(number, _COLUMN_OF[field], sentence)
             wrong.add(field)
@@ -365,6 +392,8 @@ def read_job_table(
         )
     _check_after(rows, faults, closed=closed)
     faults.raise_any(where)
+    for sentence in doubts.lines():
+        _LOG.warning("%s,%s", where, sentence[1:])
     if not jobs:
         raise ScenarioError(f"{where} has no jobs; give a row of headings, then one row for each job.")
     return jobs
@@ -417,7 +446,12 @@ def _read_head(number: int, head: Sequence[Cell], faults: _Faults) -> dict[int, 
 
 
 def _read_row(
-    number: int, cells: Sequence[Cell], columns: Mapping[int, tuple[str, float]], dialect: _Dialect, faults: _Faults
+    number: int,
+    cells: Sequence[Cell],
+    columns: Mapping[int, tuple[str, float]],
+    dialect: _Dialect,
+    faults: _Faults,
+    doubts: _Faults,
 ) -> tuple[Row, set[str]]:
     """Values of a row, and the fields whose cells cannot be read."""
     row, wrong = Row(**{field: default for field, _, default in _COLUMNS.values()}), set[str]()
@@ -426,7 +460,8 @@ def _read_row(
         field, convert, _ = _COLUMNS[column]
         try:
             if not _is_empty(cell):
-                setattr(row, field, convert(cell, dialect._replace(factor=factor)))
+                tell = partial(doubts.add, number, column)
+                setattr(row, field, convert(cell, dialect._replace(factor=factor, tell=tell)))
             elif column in _NEEDED:
                 raise ValueError("is empty; every job needs one")
         except ValueError as error:
@@ -669,5 +704,7 @@ def shift_begin(given: object, where: str, zone: tzinfo | None = None) -> dateti
             check_exists(begin, f"{where} = {given}")
         except ValueError as error:
             raise ScenarioError(f"{error}.") from error
+        if sentence := twice(begin):
+            _LOG.warning("%s = %s %s.", where, given, sentence)
         return begin.astimezone(zone or begin.tzinfo)
     raise ScenarioError(f"{where} must be {DATE} (got {given}).")

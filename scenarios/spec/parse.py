@@ -164,7 +164,7 @@ def parse_toml(content: bytes, path: Path) -> Scenario:
         scenario = parse_scenario({"name": path.stem, **raw}, path)
     except RecursionError as error:
         raise ScenarioError(f"{path.name}: its tables are nested too deeply; a scenario needs 4 levels.") from error
-    check_ambient([time_s for time_s, _ in scenario.ambient.points], scenario.horizon_s, f"{path.name}: ambient.points")
+    check_ambient(scenario.ambient.points, scenario.horizon_s, f"{path.name}: ambient.points")
     for i, stream in enumerate(scenario.jobs):
         if stream.numbered and stream.arrivals.times_s is not None:
             times = [time + stream.arrivals.start_s for time in stream.arrivals.times_s]

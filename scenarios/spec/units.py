@@ -19,6 +19,10 @@ MOST_NAMED = 3
 """Times that a warning names."""
 
 
+HOT_CELL_C = 50.0
+"""Allowed ambient temperatures from here on are probably in °F."""
+
+
 class _Mistake(NamedTuple):
     unit: str
     """Probably meant."""
@@ -129,8 +133,11 @@ def check_times(times_s: Sequence[float], horizon_s: float, where: str, names: S
         _LOG.warning("%s: all %d times are within %g s of a shift of %g s.%s", where, count, last, horizon_s, question)
 
 
-def check_ambient(times_s: Sequence[float], horizon_s: float, where: str) -> None:
-    """Log a warning if the times of ambient temperatures are probably in another unit; `where` begins it."""
+def check_ambient(points: Sequence[tuple[float, float]], horizon_s: float, where: str) -> None:
+    """Log a warning if times or values of ambient temperatures are probably in another unit; `where` begins it."""
+    times_s, hottest_c = [time_s for time_s, _ in points], max((c for _, c in points), default=0.0)
+    if hottest_c >= HOT_CELL_C:
+        _LOG.warning("%s: %g °C: is this °F? %s", where, hottest_c, _MEANT["°F"](hottest_c))
     if times_s and (asked := _unit_of_times(times_s, horizon_s)):
         _LOG.warning("%s: the last time is %g.%s", where, max(times_s), asked)
 

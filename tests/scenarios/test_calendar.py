@@ -73,6 +73,24 @@ def test_a_weekly_break_knows_summer_time(shift_begin, expected) -> None:
     assert hours(with_breaks(entry, shift_begin=shift_begin, time_zone="Europe/Berlin")) == expected
 
 
+@pytest.mark.parametrize(
+    ("date", "sentence"),
+    [
+        ("29 Mar 2026", "02:30 does not exist: summer time leaves out this hour, so it counts as 03:30."),
+        ("25 Oct 2026", "02:30 occurs twice, as summer time ends: 2026-10-25T02:30+02:00 is taken, not"),
+    ],
+)
+def test_a_recurring_time_of_day_that_occurs_never_or_twice_is_told(date, sentence, caplog) -> None:
+    month = "03-28" if "Mar" in date else "10-24"
+    begin = {"shift_begin": f"2026-{month}T20:00", "time_zone": "Europe/Berlin", "horizon_s": 20 * HOUR_S}
+    assert hours(with_breaks({"name": "tea", "begin": "2:30", "end": "3:45"}, **begin))[0][0] == 6.5
+    assert f"breaks[0]: {date} {sentence}" in caplog.text
+    caplog.clear()
+    stream = small()["jobs"][0] | {"arrivals": {"kind": "weekly", "at": ["2:30"]}}
+    parse_scenario(small() | begin | {"jobs": [stream]}, FILE)
+    assert f"jobs[0].arrivals: {date} {sentence}" in caplog.text
+
+
 def test_a_daily_night_break_covers_the_begin_of_the_shift() -> None:
     days = ["monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday"]
     entry = {"name": "night", "begin": "22:00", "end": "6:00", "weekdays": days}

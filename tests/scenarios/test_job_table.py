@@ -2,7 +2,9 @@
 
 import csv
 import io
+import re
 import time
+import tomllib
 from datetime import UTC, datetime, timedelta, timezone
 from datetime import time as clock
 from pathlib import Path
@@ -25,7 +27,7 @@ from scenarios.run.shift import run
 from scenarios.spec.job_table import read_job_table
 from scenarios.spec.jobs import draw_jobs
 from scenarios.spec.load import library, load
-from scenarios.spec.parse import scenario_hash
+from scenarios.spec.parse import parse_scenario, scenario_hash
 from scenarios.spec.schema import Scenario
 from tests.scenarios.conftest import SMALL
 
@@ -305,6 +307,25 @@ def test_a_time_of_day_that_summer_time_leaves_out_is_told(tmp_path):
             assert f"column release: '{release}' does not exist: summer time leaves out this hour" in faults
 
 
+def test_a_time_of_day_that_occurs_twice_is_told(tmp_path, caplog):
+    for shift_begin, release, told in (
+        ("2026-10-25T01:59:00", "2:00", True),
+        ("2026-10-25T01:59:00", "2026-10-25T02:00", True),
+        ("2026-10-25T01:59:00", "2026-10-25T02:00+02:00", False),
+        ("2026-10-25T02:29:00+01:00", "2:30", False),  # begins between both
+    ):
+        caplog.clear()
+        begin, text = (
+            f'time_zone = "Europe/Berlin"\nshift_begin = {shift_begin}',
+            f"{SHORT}\na,hold,bench,,,{release},,,,\n",
+        )
+        assert drawn(small_table(tmp_path, text, begin), 0)[0].release_s == 60.0
+        sentence = f"row 2, column release: '{release}' occurs twice, as summer time ends: 2026-10-25T02:00+02:00 is"
+        assert (sentence in caplog.text) == told
+    small_table(tmp_path, f"{SHORT}\na,hold,bench,,,,,,,\n", begin.removesuffix("+01:00"))
+    assert "shift_begin = 2026-10-25 02:29:00 occurs twice, as summer time ends" in caplog.text
+
+
 def test_only_plain_numbers_are_scaled_to_the_unit_of_a_heading(tmp_path):
     text = "name,kind,places,release_min,due_min\na,hold,bench,1,6:02\nb,hold,bench,0,2026-11-23T06:02:30+01:00\n"
     jobs = drawn(small_table(tmp_path, text, "shift_begin = 2026-11-23T06:00:00+01:00"), 0)
@@ -426,6 +447,24 @@ def test_a_thousand_rows_are_read_and_all_their_faults_told_soon(tmp_path):
     began_s = time.process_time()
     assert len(small_table(tmp_path, "\n".join([SHORT, *rows])).jobs) == 1000
     assert time.process_time() - began_s < SOON_S
+
+
+def test_jobs_that_cannot_finish_in_time_are_told(tmp_path, caplog, plans):
+    table = small_table(tmp_path, f"{SHORT}\na,hold,bench,,,,1,,,\nb,hold,bench,,,,1,yes,,\nc,hold,bench,,,179,,,,\n")
+    raw = tomllib.loads(SMALL) | {"name": "heat", "horizon_s": 10}
+    raw["jobs"][1]["due_s"] = 0.5
+    for scenario in (table, parse_scenario(raw, tmp_path)):
+        prepare(scenario, difficulty="blind", cache=plans)
+    assert [re.sub(r"[\d.]+ s \(", "… s (", each.message) for each in caplog.records] == [
+        "cell.toml: 'jobs.csv', row 2, column due: 'a' takes at least … s (1 cycle), but has 1 s until it is due. Are "
+        "its times minutes? Give seconds.",
+        "cell.toml: 'jobs.csv', row 4, column release: 'c' takes at least … s (1 cycle), but has 1 s until the shift "
+        "ends. Are its times minutes? Give seconds.",
+        "heat.toml: horizon_s: 'hold' takes at least … s (1 cycle), but has 10 s until the shift ends. Are its times "
+        "minutes? Give seconds.",
+        "heat.toml: jobs[1].due_s: 'sort' takes at least … s (1 cycle), but has 0.5 s until it is due. Are its times "
+        "minutes? Give seconds.",
+    ]
 
 
 def test_rows_outside_the_shift_are_counted_and_a_name_of_a_streams_job_is_refused(tmp_path, caplog, plans):

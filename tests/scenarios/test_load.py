@@ -332,10 +332,11 @@ def test_the_warning_counts_the_times_that_lie_outside(tmp_path_factory, inside,
 
 
 def test_a_trace_in_minutes_or_partly_in_milliseconds_is_asked_about(tmp_path, caplog):
-    ambient = "[ambient]\npoints = [[0, 20], [1, 25], [3, 22]]\n"
+    ambient = "[ambient]\npoints = [[0, 20], [1, 55], [3, 22]]\n"
     (tmp_path / "cell.toml").write_text(f"{SMALL}\n{ambient}", encoding="utf-8")
     load(tmp_path / "cell.toml")
     assert "cell.toml: ambient.points: the last time is 3. Are these minutes? 3 min is 180 s. Give" in caplog.text
+    assert "cell.toml: ambient.points: 55 °C: is this °F? 55 °F is 12.8 °C. Give °C." in caplog.text
     with_trace(tmp_path, b"0\n0.5\n1.9\n")
     assert "Are these hours? 1.9 h is 6840 s. Give seconds." in caplog.text
     with_trace(tmp_path, b"0\n60\n118\n")

@@ -240,6 +240,9 @@ def test_an_identified_arm_is_told_whole_with_its_air_and_its_place_and_is_not_r
     wrong = "copper_w_per_a2 of joint 1 is 9 times that of a nominal Gen3, and a residual of 0.6 K"
     assert doubts_of(network)[0].startswith(f"Do not trust this network: {wrong}")
     before = (tmp_path / "rc" / "rc.json").read_bytes()
+    fahrenheit = thermofleet(*identify, "--ambient", 55, "--overwrite")
+    assert fahrenheit.code == 2
+    assert "has a motor at 30.0 °C, below the ambient temperature of 55 °C" in " ".join(fahrenheit.err.split())
     again = thermofleet(*identify, "--ambient", 25)
     assert again.code == 2
     assert "rc.json' exists; give another --out, or --overwrite to replace it." in again.err

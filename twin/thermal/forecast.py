@@ -272,13 +272,18 @@ def _end_of(so_far: Recording, motors: Motors, ambient_c: float) -> tuple[HeatLo
             f"The log '{so_far.name}' has less than {LEAST_S:.0f} s since its start or its last gap. Housings have no "
             "sensor: record some minutes before the forecast, better half an hour."
         )
-    coolest_c = float(so_far.temp_c[-1].min())
+    check_ambient(late, ambient_c)
+    return logs[-1], so_far.temp_c[-1]
+
+
+def check_ambient(log: Recording, ambient_c: float) -> None:
+    """Raise a FleetError if a motor temperature of a log is below its ambient temperature."""
+    coolest_c = np.inf if log.temp_c is None else float(log.temp_c.min(initial=np.inf))
     if coolest_c < ambient_c - BELOW_AMBIENT_K:
         raise FleetError(
-            f"The log '{so_far.name}' ends with a motor at {coolest_c:.1f} °C, below the ambient temperature of "
-            f"{ambient_c:g} °C, which no powered motor can be. State the ambient temperature of the log (--ambient)."
+            f"The log '{log.name}' has a motor at {coolest_c:.1f} °C, below the ambient temperature of {ambient_c:g} "
+            "°C, which no powered motor can be. State the ambient temperature of the log in °C (--ambient)."
         )
-    return logs[-1], so_far.temp_c[-1]
 
 
 def _cycle_of(plan: Recording, motors: Motors) -> HeatLog:
