@@ -5,7 +5,7 @@ The processes end soon after the one that started them, also if that is killed.
 
 import os
 import threading
-import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -89,21 +89,16 @@ class LocalWorker:
     def __init__(self, threads: int = 1) -> None:
         self._threads = threads
         self._pool = self._new()
-        self._idle_since_s = time.monotonic()
 
     def _new(self) -> ProcessPoolExecutor:
         how = {"context": get_context("loky"), "env": {"OMP_NUM_THREADS": str(self._threads)}, "timeout": IDLE_S}
         return ProcessPoolExecutor(1, initializer=_begin, initargs=(os.getpid(),), **how)
 
     def submit(self, work: WorkUnit[Result]) -> "Future[Result]":
-        if time.monotonic() - self._idle_since_s > IDLE_S / 2:  # the process could end just as it gets the work
-            self.renew()
-        future = self._pool.submit(work)
-        future.add_done_callback(self._begin_idling)
-        return future
-
-    def _begin_idling(self, _: "Future[Any]") -> None:
-        self._idle_since_s = time.monotonic()
+        # A process that was idle, or has grown, may end just as it gets the work. loky starts another and warns on its
+        # own thread, which would end where warnings are errors.
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
+        return self._pool.submit(work)
 
     def died(self, error: BaseException) -> bool:
         return isinstance(error, BrokenProcessPool)

@@ -70,13 +70,25 @@ def die_once(marker: Path) -> str:
     return "done"
 
 
-@pytest.mark.parametrize(("idle_s", "same"), [(3600.0, True), (0.02, False)])
-def test_a_process_that_could_soon_end_gets_no_work(monkeypatch, idle_s, same):
+KEPT = []
+
+
+def grow():
+    """Keep more memory than loky grants a process, so that it ends after this."""
+    PAUSE.wait(1.1)  # the time between its checks
+    KEPT.append(np.ones(50_000_000))
+    return os.getpid()
+
+
+def test_a_process_that_ends_as_it_gets_work_is_replaced(monkeypatch):
+    monkeypatch.setattr("scenarios.processes.IDLE_S", 0.3)
     worker = LocalWorker()
-    first = worker.submit(Call(0, os.getpid, ())).result(PATIENCE_S)
-    monkeypatch.setattr("scenarios.processes.IDLE_S", idle_s)
-    PAUSE.wait(0.02)
-    assert (worker.submit(Call(1, os.getpid, ())).result(PATIENCE_S) == first) == same
+    ran = [worker.submit(Call(n, function, ())).result(PATIENCE_S) for n, function in enumerate((os.getpid, grow))]
+    ran += [worker.submit(Call(n, os.getpid, ())).result(PATIENCE_S) for n in range(2)]
+    for pause_s in (0.29, 0.3, 0.31):
+        PAUSE.wait(pause_s)
+        ran.append(worker.submit(Call(9, os.getpid, ())).result(PATIENCE_S))
+    assert len(set(ran)) >= 2
     worker.close()
 
 
