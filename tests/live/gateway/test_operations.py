@@ -17,6 +17,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobStatus
 from fleet.bus.protocol.operator import Alarm
 from fleet.errors import FleetError
+from fleet.live.monitor import alarms
 from fleet.live.monitor.snapshot import ArmSnapshot, AuctioneerSnapshot, FleetListener, FleetSnapshot
 from scenarios.live import webhooks
 from scenarios.live.metrics import METRICS, exposition
@@ -159,6 +160,24 @@ def test_two_gateways_of_a_fleet_show_one_alarm_with_one_acknowledgement(gateway
         assert second.ask("POST", "/v4/alarms", {"alarm": first["alarm"], "by": "ann"})[0] == 200
         wait_until(lambda: alarm_of(gateway)["by"] == "ann")
         assert gateway.ask("POST", "/v4/alarms", {"alarm": first["alarm"], "by": "bob"})[0] == 409
+
+
+def test_an_alarm_of_a_monitor_that_has_exited_ends(gateway, router, monkeypatch):
+    """Not while it is present, and not if it is about an auctioneer that the gateway has not heard."""
+
+    def lasting():
+        return {each["alarm"] for each in gateway.ask("GET", "/v4/alarms")[2] if each["ended_s"] is None}
+
+    monkeypatch.setattr(alarms, "HOLD_S", 0.0)
+    with BusClient(router, "f") as link:
+        link.declare_token(keys.build("f", "monitor", "alive", "gone"))
+        link.declare_token(keys.of_auction("f", "unheard", "alive"))
+        publish = link.publisher(keys.build("f", "monitor", "alarm", "gone"), Alarm)
+        publish(Alarm("gone", 1, 2.0, "of it", "fault", "It found it."))
+        publish(Alarm("gone", 2, 2.0, "silence", "silent", "It does not reply.", "unheard"))
+        wait_until(lambda: {"of it", "silence"} <= lasting())
+    wait_until(lambda: "of it" not in lasting())
+    assert "silence" in lasting()
 
 
 def test_events_of_unknown_kinds_are_counted_together(gateway, router):
