@@ -475,6 +475,7 @@ OUT = (event(10.0, "fault", job="", reason="joint 2 passed 75 °C"), event(590.0
         (FAULTED, 30.0, "arm_a faulted during it at 0:02:30"),
         ((), 62.0, "arm_a was idle above the warning limit"),
         ((), 30.0, "arm_a was idle: its place was taken, or the policy let it wait"),
+        ((), math.nan, "arm_a was absent, or no state was recorded"),
     ],
 )  # fmt: skip
 def test_the_reason_of_a_late_job_is_what_took_most_of_its_wait(before, temp_c: float, reason: str) -> None:

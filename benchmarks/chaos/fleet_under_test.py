@@ -231,6 +231,7 @@ class JournalFiles:
         """Follow the journals of a folder, which need not exist yet."""
         self._folder = folder
         self._read_s: dict[Path, float] = {}
+        self._stamps: dict[Path, object] = {}
         self._ended: dict[str, set[tuple[str, str]]] = {}
         """Finished jobs with their awards, by arm."""
         self._named: dict[str, set[str]] = {}
@@ -241,7 +242,7 @@ class JournalFiles:
         for path in self._folder.glob("*.journal"):
             if path.stem != "auctioneer" and time.monotonic() >= self._read_s.get(path, 0.0) + every_s:
                 self._read_s[path] = time.monotonic()
-                for record in records_of(path):
+                for record in records_of(path, self._stamps):
                     if isinstance(record, Closed) and record.report.outcome == "finished":
                         self._ended.setdefault(path.stem, set()).add((record.report.job, record.report.award))
                     elif isinstance(record, JobsFinished):
@@ -249,6 +250,7 @@ class JournalFiles:
 
     def count_finished(self) -> Counter[str]:
         """Count how often each job was finished: once for each award, and at least once by each arm that names it."""
+        self._stamps.clear()  # also what has changed twice in one tick of the file system's clock
         self.follow(every_s=0.0)
         done: Counter[str] = Counter()
         for arm in self._ended.keys() | self._named.keys():
@@ -258,13 +260,20 @@ class JournalFiles:
         return done
 
 
-def records_of(path: Path) -> list[ArmRecord]:
-    """Return the records of an arm's journal by a copy, as its process has it open; none if it changes meanwhile."""
+def records_of(path: Path, stamps: dict[Path, object]) -> list[ArmRecord]:
+    """Return the records of an arm's journal by a copy, as its process has it open; none if it changes meanwhile.
+
+    Args:
+        stamps: Sizes and times of the files at the last copy, by journal; none is made, or returned, of the same ones.
+    """
     with tempfile.TemporaryDirectory() as folder:
         try:
-            for each in (path, path.with_name(f"{path.name}-wal")):
-                if each.exists():
-                    shutil.copyfile(each, Path(folder) / each.name)
+            there = [each for each in (path, path.with_name(f"{path.name}-wal")) if each.exists()]
+            before, stamps[path] = stamps.get(path), [(each.stat().st_size, each.stat().st_mtime_ns) for each in there]
+            if stamps[path] == before:
+                return []
+            for each in there:
+                shutil.copyfile(each, Path(folder) / each.name)
             with Journal[ArmRecord](Path(folder) / path.name, ArmRecord, durable=False) as journal:
                 return list(journal.records())
         except (JournalError, OSError):

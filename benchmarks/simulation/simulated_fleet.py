@@ -1,7 +1,7 @@
 """A simulated fleet: its processes, what its arms do, and the rules that hold at every moment.
 
 The last cycle of a job is done at most once; no two arms have one job; no two arms are away from home on plans that
-exclude each other; an accepted job stays known.
+exclude each other; an accepted job stays known; who has granted an award keeps it while its arm counts a lease.
 """
 
 from collections.abc import Mapping
@@ -186,10 +186,23 @@ class Fleet:
             if node is None:
                 continue
             for active in node.executor.active:
+                if process.real_s < active.lease_end_s:
+                    self._check_granters(process, active)
                 if active.may_commit or process.real_s < active.lease_end_s:
                     if active.job in holders:
                         raise Violation(f"'{name}' and '{holders[active.job]}' both have '{active.job}'.")
                     holders[active.job] = name
+
+    def _check_granters(self, holder: Process, active: Any) -> None:
+        name, ends_s = active.award.award, {AUCTIONEER: active.lease_end_s}
+        if self.alone:
+            vote = self.node(holder.name).work_source.participant.claimant._votes.get(name)
+            ends_s = {arm: asked_s + active.lease_s for arm, asked_s in vote.granted_s.items()} if vote else {}
+        for granter, end_s in ends_s.items():
+            node = self.node(granter) if holder.real_s < end_s else None
+            book = None if node is None else (node.work_source if self.alone else node).book
+            if book is not None and name not in book.open:
+                raise Violation(f"'{granter}' has dropped '{name}', for which '{holder.name}' counts its lease.")
 
     def _check_known(self) -> None:
         book = self.node(AUCTIONEER).book

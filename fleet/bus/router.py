@@ -402,7 +402,7 @@ ALL_TOKENS = f"{keys.PREFIX}/*/*/*/alive"
 
 
 def fleets_at(endpoint: str, *, timeout_s: float = 5.0) -> tuple[str, ...]:
-    """Names of the fleets with a present participant, sorted.
+    """Names of the fleets with a present participant other than a monitor, sorted.
 
     With TLS no participant may look beyond its own fleet, which the roster in its folder names, if there is one.
 
@@ -415,7 +415,8 @@ def fleets_at(endpoint: str, *, timeout_s: float = 5.0) -> tuple[str, ...]:
     fleets: set[str] = set()
     for key in _tokens(endpoint, ALL_TOKENS, timeout_s):
         with suppress(ValueError):  # a foreign token
-            fleets.add(keys.parse(key).fleet)
+            if (parsed := keys.parse(key)).role != "monitor":
+                fleets.add(parsed.fleet)
     return tuple(sorted(fleets))
 
 

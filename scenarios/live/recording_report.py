@@ -102,7 +102,7 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
         events=events,
         jobs=jobs,
         notices=(*map(_request_notice, operations.to_pylist()), *_alarm_notices(alarms, arms, jobs)),
-        halts=tuple(_halts(alarms, operations)),
+        halts=tuple(_halts(alarms, operations, results["time_s"].to_pylist())),
         ended_s=min((row["time_s"] for row in results.to_pylist() if row["shift_ended"]), default=math.inf),
         offers=tuple(offer for row in results.to_pylist() for offer in offers_of(row)),
         model=model,
@@ -410,10 +410,14 @@ def _alarm_notices(alarms: Sequence[Alarm], arms: Sequence[str], jobs: Sequence[
                 yield Notice(time_s=time_s, kind=kind, arm=arm, job=job, reason=reason)
 
 
-def _halts(alarms: Sequence[Alarm], operations: pa.Table) -> Iterator[Halt]:
-    """When nobody replied about the jobs, and when arms were paused."""
+def _halts(alarms: Sequence[Alarm], operations: pa.Table, results_s: Sequence[float]) -> Iterator[Halt]:
+    """When nobody replied about the jobs, and when arms were paused.
+
+    Args:
+        results_s: Times of the results, ascending: the next one ends an alarm whose gateway has exited.
+    """
     for alarm in {alarm.alarm: alarm for alarm in alarms if alarm.kind == "silent"}.values():
-        end_s = math.inf if alarm.ended_s is None else alarm.ended_s
+        end_s = next((s for s in results_s if s > alarm.time_s), math.inf) if alarm.ended_s is None else alarm.ended_s
         yield Halt(arm="", start_s=alarm.began_s, end_s=end_s, reason=f"{alarm.subject} did not reply")
     paused: dict[str, Halt] = {}
     for row in operations.to_pylist():

@@ -346,8 +346,9 @@ def _arm_time(
     were = "were" if len(able) > 1 else "was"
     earlier, out = f"{were} at work since before its release", f"{were} out after a fault"
     failed, paused = f"{were} out after a failure", PAUSED
+    absent = f"{were} absent, or no state was recorded"
     hot, idle = f"{were} idle above the warning limit", f"{were} idle: its place was taken, or the policy let it wait"
-    time_s: dict[str, float] = dict.fromkeys((*halts, "", earlier, out, failed, paused, hot, idle), 0.0)
+    time_s: dict[str, float] = dict.fromkeys((*halts, "", earlier, out, failed, paused, hot, idle, absent), 0.0)
     at_s = log.readings.time_s
     step_s = float(np.median(np.diff(at_s))) if len(at_s) > 1 else 0.0
     for arm in able:
@@ -362,7 +363,8 @@ def _arm_time(
             free &= (at_s < span.start_s) | (at_s >= span.end_s)
         peak_c = np.fmax.reduce(log.readings.temp_c[free, log.arms.index(arm)], axis=-1, initial=-math.inf)
         time_s[hot] += step_s * float((peak_c >= log.limits.warning_c).sum())
-        time_s[idle] += step_s * float((peak_c < log.limits.warning_c).sum())
+        time_s[absent] += step_s * float(np.isneginf(peak_c).sum())
+        time_s[idle] += step_s * float((np.isfinite(peak_c) & (peak_c < log.limits.warning_c)).sum())
     return time_s
 
 

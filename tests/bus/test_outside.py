@@ -31,7 +31,7 @@ CHANNELS = {name: (channel["address"], channel["x-zenoh"]) for name, channel in 
 QUERIED = {name for name, (_, how) in CHANNELS.items() if how["pattern"] == "query"}
 ARM = {"arm_alive", "arm_state", "arm_info", "arm_difficulty"}
 """What a simulated shift has."""
-GATEWAY = {"monitor_alarm"}
+GATEWAY = {"monitor_alive", "monitor_alarm"}
 CONSENSUS = {"arm_bid", "arm_claim", "arm_operation"}
 PATIENCE_S = 240.0
 REPEATED = 2

@@ -1,8 +1,10 @@
 """Why a job waits: one sentence for each cause, and always the true one."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec import structs
 
 from fleet.bus.protocol.auction import NOT_PLANNED, JobEstimate, JobSpec, PlanQuote, Quote, QuoteRequest
 from fleet.bus.protocol.messages import State
@@ -40,6 +42,10 @@ def bidding(*quotes: Quote, **more: Any) -> Bidding:
     ("given", "expected"),
     [
         (bidding(quote("a"), quote("b", capacity=0)), "The policy lets it wait: a could begin it."),
+        (
+            replace(bidding(quote("a")), time_s=7030.0, jobs=(structs.replace(JOB, due_s=1000.0),)),
+            "The policy lets it wait: it would end 101 min late; a could begin it.",
+        ),
         (
             bidding(quote("a"), quote("b", plans=(), reason="too far"), taken={"c": frozenset(["near"])}),
             "It waits until c is out of the way.",

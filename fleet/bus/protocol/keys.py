@@ -1,7 +1,7 @@
 """Keys of the bus and what travels under each: one table, and the functions that build and parse keys.
 
 `thermofleet/v4/{fleet}/…` with `arm/{arm}/{topic}`, `auction/{auctioneer}/{topic}`, `jobs/{topic}`, `clock/now`,
-`policy/{policy}/act` and `monitor/{monitor}/alarm`. An arm queries an auctioneer under
+`policy/{policy}/act` and `monitor/{monitor}/{topic}`. An arm queries an auctioneer under
 `auction/{auctioneer}/{topic}/{arm}`, and another arm under `arm/{other}/{topic}/{arm}`: access control sees only keys,
 so the querier must be part of the key.
 
@@ -131,6 +131,7 @@ CHANNELS: tuple[BusChannel, ...] = (
     BusChannel("jobs", "cell", "query", cell.CellRequest, cell.Cell),
     BusChannel("clock", "now", "query", auction.ClockRequest, auction.Clock),
     BusChannel("policy", "act", "query", policy.ActRequest, policy.ActReply, receiver="auctioneer, or simulated shift"),
+    BusChannel("monitor", "alive", "token", lease_s=SESSION_LEASE_S),
     BusChannel("monitor", "alarm", "publish", operator.Alarm, history=HISTORY),
 )
 CHANNEL: Mapping[tuple[str, str], BusChannel] = {(channel.role, channel.topic): channel for channel in CHANNELS}

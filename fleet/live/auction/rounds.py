@@ -218,9 +218,9 @@ def reason_to_wait(bidding: Bidding, job: str) -> str:
     if not (estimates := bidding.estimates(job)):
         return "No arm has answered whether it can do it."
     able = {arm: each.plans for arm, each in estimates.items() if each.feasible}
-    if any(bidding.plans(arm, job) for arm in able):
-        free = ", ".join(arm for arm in able if bidding.plans(arm, job))
-        return f"The policy lets it wait: {free} could begin it."[:MAX_REASON]
+    if free := [arm for arm in able if bidding.plans(arm, job)]:
+        late = _lateness(bidding, job, (plan for arm in free for plan in bidding.plans(arm, job).values()))
+        return f"The policy lets it wait: {late}{', '.join(free)} could begin it."[:MAX_REASON]
     refusals = {arm: each.reason or "infeasible" for arm, each in estimates.items() if not each.feasible}
     if NOT_PLANNED in refusals.values():
         return "Arms are planning its motion."
@@ -232,6 +232,14 @@ def reason_to_wait(bidding: Bidding, job: str) -> str:
     taken = [f"{arm} {_why_without_capacity(bidding, arm)}" for arm in able if arm in bidding.full]
     reasons += [f"{', '.join(taken)}."] if taken else []
     return " ".join(reasons)[:MAX_REASON]
+
+
+def _lateness(bidding: Bidding, job: str, plans: Iterable[PlanQuote]) -> str:
+    """By how much a job would end after its due date if it began now; "" if in time, or without such a date."""
+    due_s = next((each.due_s for each in bidding.jobs if each.name == job), None)
+    takes_s = min((plan.duration_s or 0.0 for plan in plans), default=0.0)
+    late_s = 0.0 if due_s is None else bidding.time_s + takes_s - due_s
+    return f"it would end {late_s / 60:.0f} min late; " if late_s >= 60.0 else ""
 
 
 def _why_without_capacity(bidding: Bidding, arm: str) -> str:

@@ -53,8 +53,13 @@ class AlarmList:
                 self.alarms[name] = alarm
             else:
                 self._change(alarm, alarm.time_s)
-            if alarm.ended_s is None:
-                self._found_s[name] = math.inf
+        self.take_up(monitor)
+
+    def take_up(self, gone: str) -> None:
+        """End the alarms that a monitor which has exited, or this one, last changed, once they are not found."""
+        for name, alarm in self.alarms.items():
+            if alarm.ended_s is None and alarm.monitor in (gone, self.monitor):
+                self._found_s.setdefault(name, math.inf)
 
     def update(
         self,
@@ -66,7 +71,7 @@ class AlarmList:
     ) -> list[Alarm]:
         """Begin and end alarms by the present findings; return those that have changed.
 
-        A monitor ends only alarms whose finding it has had itself, or that are of the recording.
+        A monitor ends only alarms whose finding it has had itself, or that it has taken up.
 
         Args:
             heard: Arms and jobs of which the monitor knows: an alarm of another one lasts until a person has seen it,

@@ -135,6 +135,8 @@ class AsyncBridge:
         self._alarms, self._on_alarm = AlarmList(name, self._listener.view.alarms, kept), on_alarm
         self._more_findings = more_findings
         self._publish = link.publisher(keys.build(self.fleet, "monitor", "alarm", name), Alarm)
+        link.declare_token(keys.build(self.fleet, "monitor", "alive", name))
+        link.watch_tokens(keys.of_every(self.fleet, "monitor", "alive"), self._monitor)
         self._check_s = time.monotonic() + FRESH_S  # by then it has heard from everybody who is there
         self._earlier = deque[FleetSnapshot](maxlen=3)
         self._told = {each.alarm: (each.ended_s is None, each.by) for each in self._alarms.alarms.values()}
@@ -230,7 +232,7 @@ class AsyncBridge:
         findings = check_fleet(now, self._earlier[0] if len(self._earlier) == self._earlier.maxlen else None)
         self._earlier.append(now)
         heard = {each.arm for each in now.arms} | {each.job for each in now.jobs}
-        heard |= {each.auctioneer for each in now.auctioneers}
+        heard |= {each.auctioneer for each in now.auctioneers if each.heard_age_s is not None}
         findings += self._more_findings()
         for alarm in self._alarms.update(findings, fleet_time_s(now), real_s, heard, now.speed or 1.0):
             self._publish(alarm)
@@ -242,6 +244,10 @@ class AsyncBridge:
 
     def _message(self, topic: str, name: str, message: msgspec.Struct) -> None:
         self._on_loop(lambda: self._add(topic, name, encode(message)))
+
+    def _monitor(self, name: str, present: bool) -> None:
+        if not present:
+            self._alarms.take_up(name)
 
     def _presence(self, role: Role, name: str, present: bool) -> None:
         data = msgspec.json.encode({"role": role, "name": name, "there": present})

@@ -101,6 +101,9 @@ def test_a_monitor_that_joins_takes_up_the_alarms_of_another_and_ends_only_what_
     assert joined.update([HOT], 20.0, 20.0) == []
     assert [each.subject for each in joined.update([], 30.0, 30.0)] == ["a"]
     assert [each.subject for each in view.alarms.values() if each.ended_s is None] == ["b"]
+    joined.take_up("m")  # it has exited
+    assert [joined.update([], s, s) for s in (31.0, 36.0)] == [[], []]
+    assert [(each.subject, each.ended_s) for each in joined.update([], 37.0, 37.0)] == [("b", 31.0)]
 
 
 def test_a_late_message_of_an_alarm_changes_nothing_and_a_new_epoch_does():

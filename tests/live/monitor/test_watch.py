@@ -161,8 +161,10 @@ def test_watch_waits_for_a_router_and_a_fleet():
 
 @pytest.mark.parametrize("fleets", [(), ("f", "g")])
 def test_an_ambiguous_fleet_is_an_error(fleets, token_reaches):
-    with Router() as router:
+    with Router() as router, BusClient(router.endpoint, "m") as monitor:
         links = [BusClient(router.endpoint, name).open() for name in fleets]
+        monitor.declare_token(keys.build("m", "monitor", "alive", "m"))  # makes no fleet
+        token_reaches(monitor, keys.build("m", "monitor", "alive", "m"))
         for link in links:
             link.declare_token(keys.of_arm(link.fleet, "a", "alive"))
             token_reaches(links[0], keys.of_arm(link.fleet, "a", "alive"))
