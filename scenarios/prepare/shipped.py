@@ -50,7 +50,11 @@ def is_shipped(scenario: str) -> bool:
 
 
 def unpack_shipped(scenario: str, folder: Path) -> None:
-    """Add the shipped plans and models of a scenario, if any, to a cache folder, once. Files that exist are kept."""
+    """Put the shipped plans and models of a scenario, if any, into a cache folder, once.
+
+    They replace plans that another scenario with the same arms has left: on another processor those differ by rounding,
+    and models are looked up by the plans.
+    """
     if not is_shipped(scenario):
         return
     archive = archive_of(scenario)
@@ -61,7 +65,7 @@ def unpack_shipped(scenario: str, folder: Path) -> None:
     with tarfile.open(archive) as packed:
         for member in packed:
             path, content = folder / member.name, packed.extractfile(member)
-            if content is None or path.exists():
+            if content is None:
                 continue
             path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_path(path) as draft:

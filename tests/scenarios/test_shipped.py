@@ -36,6 +36,11 @@ def prepare_shipped(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Fleet:
 
 
 def test_nothing_of_quickstart_is_computed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where another scenario of these arms was planned before."""
+    with tarfile.open(archive_of("quickstart")) as packed:
+        plan = next(name for name in packed.getnames() if name.startswith("plans/"))
+    (tmp_path / "plans").mkdir()
+    (tmp_path / plan).write_bytes(b"with other last digits")
     fleet = prepare_shipped(tmp_path, monkeypatch)
     assert [arm.robot.name for arm in fleet.arms] == ["arm_0", "arm_1", "arm_2", "arm_3"]
     assert {path.name for path in tmp_path.iterdir()} == {"identified", "plans", "saturation", "shipped", "twins"}
@@ -73,7 +78,7 @@ def test_no_file_names_a_machine_or_a_time(scenario: str) -> None:
                 assert not [text for text in texts(json.load(content)) if text.startswith("/")]
 
 
-@pytest.mark.ci_slow
+@pytest.mark.slow
 def test_made_anew_they_are_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On this machine to the last digit; elsewhere training amplifies the rounding of another processor."""
     shipped = prepare_shipped(tmp_path / "shipped", monkeypatch)
