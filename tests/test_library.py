@@ -22,9 +22,7 @@ FILES = (Path(__file__).parents[1] / "scenarios" / "library").glob("*.toml")
 NAMES = sorted(path.stem for path in FILES)
 TICKS = 20
 FIRST = ("quickstart", "heat_wave")
-"""Scenarios in which every rule is tried; CI tries it in two more, and in others a simple one and one that reads
-scores."""
-SECOND = ("active_waiting", "people_near")
+"""Scenarios in which every rule is tried; in others a simple one and one that reads scores."""
 
 
 def cases() -> Iterator[object]:
@@ -33,8 +31,8 @@ def cases() -> Iterator[object]:
         for policy in RULES:
             if policy in ("random", "wsept"):
                 yield pytest.param(name, policy, marks=pytest.mark.slow if name == "scale_64" else ())
-            elif name in (*FIRST, *SECOND):
-                yield pytest.param(name, policy, marks=pytest.mark.ci_slow if name in SECOND else ())
+            elif name in FIRST:
+                yield name, policy
 
 
 @pytest.fixture(scope="session")

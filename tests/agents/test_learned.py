@@ -161,7 +161,7 @@ def weights(of: Trainer) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.parametrize("decisions", ["interval", "events"])
-@pytest.mark.parametrize("algorithm", [pytest.param("mappo", marks=pytest.mark.ci_slow), "ippo"])
+@pytest.mark.parametrize("algorithm", [pytest.param("mappo", marks=pytest.mark.slow), "ippo"])
 def test_it_learns_what_is_worth_more(small, algorithm, decisions) -> None:
     learner = trainer(small, algorithm=algorithm, decisions=decisions, learning_rate=3e-3, seed=1)
     told = list(islice(learner.iterate(), 25))

@@ -182,7 +182,7 @@ def test_no_job_before_its_release_changes_a_claim(small, seed, hot, moment):
 
 
 @pytest.mark.ci_slow
-@pytest.mark.parametrize("seed", [0, 1, 2, pytest.param(3, marks=pytest.mark.slow), 4])
+@pytest.mark.parametrize("seed", [0, 1, 2, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (3, 4))])
 def test_it_finds_the_proven_optimum_where_all_jobs_are_known(small, seed):
     """Without a price of time: the whole reward of the shift is before its eyes."""
 

@@ -277,7 +277,7 @@ def test_its_time_can_be_set_and_it_catches_up_in_bounded_steps(small):
     assert body.time_s == pytest.approx(5060.0 + MAX_STEPS)
 
 
-@pytest.mark.ci_slow
+@pytest.mark.slow
 def test_a_change_of_step_changes_no_event(small):
     """A faulted arm is moved home and recovers at the same moments, whatever the steps; heat is exact at rest."""
     arm, job, plan = one_job(small, repetitions=5000, payload=small.HOT)

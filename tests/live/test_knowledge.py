@@ -252,7 +252,7 @@ def slower(small, plan):
 
 
 @pytest.mark.ci_slow
-@pytest.mark.parametrize(("error_c", "crowding"), [(75.0, 0.4), (40.0, 0.2)])
+@pytest.mark.parametrize(("error_c", "crowding"), [pytest.param(75.0, 0.4, marks=pytest.mark.slow), (40.0, 0.2)])
 def test_a_live_policy_observes_what_it_observes_in_simulation(small, error_c, crowding):
     works = [small.work(place, kg) for place in ("bench", "press", "rack") for kg in (small.LIGHT, small.HOT)]
     limits = ThermalLimits(warning_c=error_c - 2.0, error_c=error_c, restart_c=error_c - 4.0, clear_s=60.0)

@@ -7,7 +7,7 @@ from benchmarks.chaos.mesh import mesh
 ARMS, JOBS = 4, 16
 
 
-@pytest.mark.ci_slow
+@pytest.mark.slow
 def test_kill_either_router_and_cut_the_link(tmp_path):
     outcome = mesh(tmp_path, arms=ARMS, jobs=JOBS, speed=40.0)
     assert (outcome.lost, outcome.twice, outcome.exited, outcome.violations) == ((), (), (), ())

@@ -26,8 +26,7 @@ def simulate(*arguments, hash_seed="0"):
     )
 
 
-@pytest.mark.ci_slow
-@pytest.mark.parametrize("first", [0, 8])
+@pytest.mark.parametrize("first", [pytest.param(0, marks=pytest.mark.slow), pytest.param(8, marks=pytest.mark.ci_slow)])
 def test_no_rule_is_broken_under_faults(first):
     done = simulate("--first", str(first), "--seeds", "8")
     assert done.returncode == 0, done.stdout + done.stderr

@@ -35,7 +35,7 @@ def made_up(file: list[str], d: list[float], rms: list[float], temp_c: list[floa
     )
 
 
-@pytest.mark.ci_slow
+@pytest.mark.slow
 def test_a_lead_over_rms_torque_has_an_interval_over_files() -> None:
     """d ranks every window rightly, RMS torque is constant: AUROC 1 and ½ in every resample of the files."""
     file = [name for name in "abcdef" for _ in range(4)]

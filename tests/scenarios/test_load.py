@@ -425,8 +425,13 @@ BESIDE = {"left": (-0.9, 0.3, 0.25), "right": (0.9, 0.3, 0.25)}
 PLACES = {"middle": (0.0, 0.0, 0.25), "left": (-0.9, 0.3, 0.25), "moon": (9.0, 0.0, 0.2)}
 
 
-@pytest.mark.ci_slow
-@pytest.mark.parametrize("name", LIBRARY)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=getattr(pytest.mark, "ci_slow" if name == "mixed_fleet" else "slow"))
+        for name in LIBRARY
+    ],
+)
 def test_three_arms_of_every_library_cell_can_work_at_once(name, cache):
     report = layout_report(load(name))
     assert report.problems == ()

@@ -252,7 +252,7 @@ def test_an_identified_arm_is_told_whole_with_its_air_and_its_place_and_is_not_r
     assert json.loads((tmp_path / "rc" / "rc.json").read_text(encoding="utf-8"))["ambient_c"] == 25.0
 
 
-@pytest.mark.ci_slow
+@pytest.mark.slow
 def test_a_report_of_logs_that_stay_cool_says_what_is_missing_and_leaves_with_code_one(
     thermofleet, logs, tmp_path, monkeypatch
 ):
