@@ -328,7 +328,7 @@ class Relaxation:
             found.append(set(clique))
             if len(found) > MOST_CLIQUES:
                 by_arm = [{p for p in arm_of if arm_of[p] == arm} for arm in set(arm_of.values())]
-                used = set().union(*stations.values())
+                used = sorted(set().union(*stations.values()))
                 return by_arm + [{p for p in arm_of if station in stations[p]} for station in used]
         return found
 

@@ -203,7 +203,7 @@ def _most_at_once(scenario: Scenario, plans: Sequence[Plan], space: SpaceTable) 
     used, first = np.unique(volumes, return_index=True)
     if not len(used):
         return (), True
-    stations = [set(plans[row].work.stations) for row in first]
+    stations = [plans[row].work.stations for row in first]
     rows = []  # groups of volumes of which at most one is chosen
     arms = np.array([plans[row].arm for row in first])
     for arm in dict.fromkeys(arms.tolist()):

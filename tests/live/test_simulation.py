@@ -33,8 +33,9 @@ def test_no_rule_is_broken_under_faults(first):
 
 
 @pytest.mark.ci_slow
-def test_a_seed_repeats_the_same_events_in_every_process():
-    one, other = (simulate("--seed", "3", hash_seed=seed) for seed in ("1", "2"))
+@pytest.mark.parametrize("seed", ["3", "104"], ids=["auctioneer", "consensus"])
+def test_a_seed_repeats_the_same_events_in_every_process(seed):
+    one, other = (simulate("--seed", seed, hash_seed=hash_seed) for hash_seed in ("1", "2"))
     assert one.returncode == 0, one.stdout[-2000:] + one.stderr
     digests = [re.search(r"^digest (\w+)$", done.stdout, re.MULTILINE).group(1) for done in (one, other)]
     assert digests[0] == digests[1]

@@ -153,8 +153,8 @@ class Auctioneer:
         if records := adopted(self.book, history):
             _LOG.warning("%d records of what '%s' has done and has are new to the journal.", len(records), history.arm)
             self.book.record(*records)
-            for award in self.book.open.keys() - self.book.leases.keys():
-                self.book.leases[award] = CountedLease(real_s + self._timing.counted_lease_s)
+            for award in self.book.open:
+                self.book.leases.setdefault(award, CountedLease(real_s + self._timing.counted_lease_s))
 
     def add_quote(self, quote: Quote) -> None:
         """Add a quote; after the last one that the round waits for, the next tick closes it."""

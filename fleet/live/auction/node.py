@@ -66,7 +66,7 @@ class EpochCheck:
     def admitted(self, arms: Iterable[str]) -> frozenset[str]:
         """Return those of these arms whose history fits; request the others'."""
         arms = frozenset(arms)
-        for arm in arms - self._admitted - self._foreign.keys():
+        for arm in sorted(arms - self._admitted - self._foreign.keys()):
             self._ask(arm)
         return arms & self._admitted
 

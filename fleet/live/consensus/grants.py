@@ -71,7 +71,7 @@ class Granter:
         self.arm, self.roster = arm, frozenset(roster)
         self.book, self.timing, self._excludes = book, timing or Timing(), excludes
         book.name = arm
-        for each in self.roster:
+        for each in sorted(self.roster):
             book.space.setdefault(each, frozenset([ANYWHERE]))
         book.attach(keep, real_s + self.timing.counted_lease_s)
 
@@ -181,8 +181,8 @@ class Granter:
             JournalError: nothing is on disk.
         """
         self.book.record(*records)
-        for award in self.book.open.keys() - self.book.leases.keys():
-            self.book.leases[award] = CountedLease(real_s + self.timing.counted_lease_s)
+        for award in self.book.open:
+            self.book.leases.setdefault(award, CountedLease(real_s + self.timing.counted_lease_s))
 
     # Inside
 

@@ -21,6 +21,7 @@ from fleet.live.book import JobBook
 from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Claimant, Granter
 from fleet.live.epochs import check_journals
 from fleet.live.leases import Timing
+from fleet.live.records import Granted
 from tests.live.disk import Disk
 
 TIMING = Timing(lease_s=3.0, margin_s=0.05)
@@ -71,6 +72,11 @@ def test_a_repeated_claim_renews_the_lease_and_writes_nothing(granter, disk):
     for number in range(5):
         assert granted(granter.answer_claim(claim("a", number, entry()), 2.0 * number)) == ["a-1:j"]
         assert [type(record).__name__ for record in disk.records] == ["ClaimNumbered", "Granted"]
+
+
+def test_arms_and_leases_have_the_same_order_in_every_process(granter):
+    granter.adopt([Granted(f"a-1:{job}", job, "a", places=(job,)) for job in "klmnopqrstuv"], 0.0)
+    assert (list(granter.book.space), list(granter.book.leases)) == (list(ROSTER), list(granter.book.open))
 
 
 def test_a_station_serves_one_job_at_a_time(granter):
