@@ -115,7 +115,7 @@ def prepare(
         space = made.space if made else space_of(spec, robots, plans, _folder(cache), share)
         refused = tuple(error for arm in planned for error in arm.infeasible)
         fleets.append(Fleet(spec, tuple(arms), refused, space, planned=tuple(planned)))
-    late = list(late_jobs(specs[0], fleets[0].planned))
+    late = list(unfinishable_jobs(specs[0], fleets[0].planned))
     for sentence in late[:REASONS]:
         _LOG.warning("%s", sentence)
     if len(late) > REASONS:
@@ -211,7 +211,7 @@ def cell_problems(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) 
     return problems
 
 
-def late_jobs(scenario: Scenario, arms: Sequence[PlannedArm]) -> Iterator[str]:
+def unfinishable_jobs(scenario: Scenario, arms: Sequence[PlannedArm]) -> Iterator[str]:
     """A sentence for each stream whose jobs cannot finish before they are due, or in the shift."""
 
     @cache
