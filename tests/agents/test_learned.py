@@ -160,7 +160,7 @@ def weights(of: Trainer) -> dict[str, torch.Tensor]:
     return {name: value.clone() for name, value in of.actor.state_dict().items()}
 
 
-@pytest.mark.parametrize("decisions", ["interval", "events"])
+@pytest.mark.parametrize("decisions", ["interval", pytest.param("events", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("algorithm", [pytest.param("mappo", marks=pytest.mark.slow), "ippo"])
 def test_it_learns_what_is_worth_more(small, algorithm, decisions) -> None:
     learner = trainer(small, algorithm=algorithm, decisions=decisions, learning_rate=3e-3, seed=1)

@@ -420,18 +420,12 @@ def arm(name, x, y, yaw=0.0, **more):
 
 APART = (arm("west", -0.6, 0.0, home="retract"), arm("east", 0.6, 0.0, 180.0, home="retract"))
 TOGETHER = (arm("west", -0.45, 0.0), arm("east", 0.45, 0.0, 180.0), arm("north", 0.0, 0.45, 270.0))
-LIBRARY = [pytest.param(name, marks=pytest.mark.slow if name == "scale_64" else ()) for name in sorted(library())]
+CELLS = [pytest.param(name, marks=() if name == "mixed_fleet" else pytest.mark.slow) for name in sorted(library())]
 BESIDE = {"left": (-0.9, 0.3, 0.25), "right": (0.9, 0.3, 0.25)}
 PLACES = {"middle": (0.0, 0.0, 0.25), "left": (-0.9, 0.3, 0.25), "moon": (9.0, 0.0, 0.2)}
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=getattr(pytest.mark, "ci_slow" if name == "mixed_fleet" else "slow"))
-        for name in LIBRARY
-    ],
-)
+@pytest.mark.parametrize("name", CELLS)
 def test_three_arms_of_every_library_cell_can_work_at_once(name, cache):
     report = layout_report(load(name))
     assert report.problems == ()
@@ -439,7 +433,7 @@ def test_three_arms_of_every_library_cell_can_work_at_once(name, cache):
     assert report.excluded_share < 0.3
 
 
-@pytest.mark.parametrize("name", sorted({*library()} - {"scale_64"}))
+@pytest.mark.parametrize("name", [cell for cell in CELLS if cell.values != ("scale_64",)])
 def test_the_largest_set_is_the_one_that_trying_all_finds(name, cache):
     scenario = load(name)
     fleet = prepare(scenario, difficulty="blind", cache=cache)
