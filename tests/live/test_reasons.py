@@ -47,8 +47,11 @@ def bidding(*quotes: Quote, **more: Any) -> Bidding:
             "The policy lets it wait: it would end 101 min late; a could begin it.",
         ),
         (
-            bidding(quote("a"), quote("b", plans=(), reason="too far"), taken={"c": frozenset(["near"])}),
-            "It waits until c is out of the way.",
+            bidding(
+                quote("a"), quote("b", plans=(), reason="too far"),
+                taken={"c": frozenset(["near"])}, absent=frozenset(["c", "d"]),
+            ),
+            "It waits until c is out of the way. c is not present.",
         ),
         (
             bidding(quote("a"), quote("b", capacity=0), taken={"b": frozenset(["near"])}),
