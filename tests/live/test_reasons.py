@@ -14,7 +14,7 @@ from fleet.live.book import JobBook
 from fleet.live.job_rules import why_not_ready
 from fleet.live.journal import JobsAccepted
 from fleet.live.leases import expire
-from tests.live.records import awarded
+from tests.live.records import awarded, closed
 
 JOB = JobSpec(name="j", kind="hold", places=("bench",))
 NEAR = PlanQuote(plan=0, space="near", duration_s=10.0)
@@ -129,4 +129,6 @@ def test_a_lease_that_ends_while_the_auctioneer_is_stopped_is_not_blamed_on_its_
     book = JobBook().replay([JobsAccepted((JOB,)), awarded("w:j", "j")])
     book.attach(lambda *_: None, 100.0)
     assert expire(book, 100.0 + late_s, 5.0)
+    assert book.status_of(book.jobs["j"]).reason == reason
+    book.record(closed("w:j", "returned", 0, 6.0, "the award was revoked"))  # the arm knows no more
     assert book.status_of(book.jobs["j"]).reason == reason
