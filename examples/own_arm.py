@@ -9,6 +9,7 @@ it was about to finish as unfinished. An arm with a disk would continue.
 
 import json
 import queue
+import signal
 import sys
 import time
 import uuid
@@ -53,7 +54,13 @@ class Arm:
         return self.zero_s + self.speed * time.monotonic()
 
     def run(self, seconds):
-        """Take part in the fleet for this time, or until Ctrl-C; then leave it in order."""
+        """Take part in the fleet for this time, or until Ctrl-C; then leave it in order.
+
+        Raises:
+            SystemExit: an arm of this name is present. Two would act as one.
+        """
+        if any(reply.ok for reply in self.session.liveliness().get(f"{self.own_key}/alive", timeout=3.0)):
+            sys.exit(f"Arm '{self.name}' is already running. Stop it first, or give this one another name.")
         for topic, name in (("quote", "QuoteRequest"), ("award", "Award")):
             self.session.declare_queryable(f"{self.own_key}/{topic}", self.enqueue(topic, name), complete=True)
         alive = self.session.liveliness().declare_token(f"{self.own_key}/alive")
@@ -303,7 +310,7 @@ def connect(port):
 
 
 def main(port, fleet, name, seconds=float("inf")):
-    """Run the arm until Ctrl-C, or for this time."""
+    """Run the arm until Ctrl-C or SIGTERM, or for this time."""
     try:
         session = connect(port)
     except zenoh.ZError:
@@ -314,6 +321,8 @@ def main(port, fleet, name, seconds=float("inf")):
 
 if __name__ == "__main__":
     arguments = sys.argv[1:] + ["7447", "quickstart", "my_arm", "inf"][len(sys.argv) - 1 :]
+    for number in (signal.SIGINT, signal.SIGTERM):  # a service is stopped by SIGTERM
+        signal.signal(number, signal.default_int_handler)
     try:
         main(int(arguments[0]), arguments[1], arguments[2], float(arguments[3]))
     except KeyboardInterrupt:

@@ -544,7 +544,8 @@ class JobBook(TimedState[BookRecord]):
                 return self._give_up(entry)
             if was_open:
                 entry.returns, entry.returned_s = entry.returns + 1, outcome.time_s
-            return self._wait(entry, f"Its arm was paused by '{pauser}'." if pauser else outcome.reason)
+            why = outcome.reason if was_open or outcome.faults else entry.reason or outcome.reason
+            return self._wait(entry, f"Its arm was paused by '{pauser}'." if pauser else why)
         return self._set(entry, outcome) if news else self._give_up(entry)
 
     def _set(self, entry: JobEntry, outcome: JobOutcome) -> list[JobEntry]:

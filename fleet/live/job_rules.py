@@ -113,8 +113,8 @@ def reason_for_silence(arm: str) -> str:
 
 
 def reason_to_follow(before: str) -> str:
-    """Return why a job is given up that waits for one that is."""
-    return f"Given up, because it waits for '{before}', which is given up."
+    """Return why a job is given up that waits for one that is, or that was cancelled."""
+    return f"Given up, because it waits for '{before}', which is given up or cancelled."
 
 
 def admit(

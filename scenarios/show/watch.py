@@ -297,7 +297,12 @@ def heat_bar(arm: ArmSnapshot) -> Text:
 def jobs_line(fleet: FleetSnapshot) -> Text:
     """Number of jobs in each state."""
     counts = ", ".join(f"{fleet.counts[state]} {state}" for state in get_args(JobState) if fleet.counts.get(state))
-    return _line(f"jobs: {counts or 'none'}")
+    return _line(f"jobs: {counts or _none(fleet)}")
+
+
+def _none(fleet: FleetSnapshot) -> str:
+    """Of what nothing is known: none, if anybody has replied about the jobs."""
+    return "none" if any(each.heard_age_s is not None for each in fleet.auctioneers) else "unknown"
 
 
 def space_line(fleet: FleetSnapshot) -> Text:
@@ -308,7 +313,7 @@ def space_line(fleet: FleetSnapshot) -> Text:
         arm = arms.get(name)
         where = "not present" if arm is None or not arm.present else "away from home" if arm.away else "has a job"
         parts.append(f"{name} ({where}{', may be anywhere' if ANYWHERE in spaces else ''})")
-    return _line(f"space closed by: {', '.join(parts) or 'none'}")
+    return _line(f"space closed by: {', '.join(parts) or _none(fleet)}")
 
 
 def alarm_line(fleet: FleetSnapshot) -> Text:

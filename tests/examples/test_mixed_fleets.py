@@ -64,8 +64,11 @@ def test_own_arm_and_the_submitter_work_with_the_real_auctioneer(bus, tmp_path):
             assert one.returncode == 0, one.stderr
             serve_until(lambda: any(status.arm and status.job == "hold" for status in statuses), watcher)
             holder = next(status.arm for status in statuses if status.arm and status.job == "hold")
-            for arm in (first, second) if holder == "a" else (second, first):  # the other may get it meanwhile
-                arm.send_signal(signal.SIGINT)
+            with started(program("own_arm", port, "f", "a"), stderr=subprocess.PIPE) as again:
+                assert again.communicate(timeout=PATIENCE_S)[1].startswith("Arm 'a' is already running.")
+            arms = (first, second) if holder == "a" else (second, first)  # the other may get it meanwhile
+            for arm, number in zip(arms, (signal.SIGTERM, signal.SIGINT), strict=True):
+                arm.send_signal(number)
                 assert arm.wait(PATIENCE_S) == 130
             asked = keys.of_jobs("f", "status"), StatusRequest(), Status
             for _ in range(40):  # the auctioneer may still handle the last quotes and leases

@@ -122,7 +122,7 @@ def test_a_job_that_still_waits_at_its_hard_due_date_is_given_up_with_its_succes
     known = fleet.known()[0]
     assert (known["late"].state, known["z"].state) == ("given_up", "given_up")
     assert known["late"].reason == "expired: its due date passed before an arm had begun it."
-    assert known["z"].reason == "Given up, because it waits for 'late', which is given up."
+    assert known["z"].reason == "Given up, because it waits for 'late', which is given up or cancelled."
     assert known["begun"].finished_s > 60.0
 
 
@@ -232,7 +232,7 @@ def test_an_arm_that_was_never_online_keeps_all_its_space(fleet_of, alone):
     fleet.run(6.0)
     assert fleet.states("a") == {"waiting"}
     if not alone:
-        assert fleet.status("a").reason == "It waits until arm_2 is out of the way."
+        assert fleet.status("a").reason == "It waits until arm_2 is out of the way. arm_2 is not present."
     fleet.world.processes["arm_2"].start()
     fleet.until(lambda: fleet.is_everywhere("a", "finished"))
 

@@ -17,7 +17,7 @@ from tests.live.records import awarded, closed
 
 JOB = JobSpec(name="j", kind="hold", places=("x",), repetitions=9)
 NEXT = JobSpec(name="k", kind="hold", places=("x",), after=("j",))
-LOST = "Given up, because it waits for 'j', which is given up."
+LOST = "Given up, because it waits for 'j', which is given up or cancelled."
 ROSTER = ("a", "b", "c", "d")
 attempts = st.lists(st.tuples(st.sampled_from("abcd"), st.sampled_from(["faulted", "returned", "refused", "dropped"])))
 

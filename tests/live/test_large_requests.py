@@ -39,7 +39,7 @@ def test_a_cancelled_job_gives_up_a_long_chain_that_waits_for_it_soon(auctioneer
     assert time.process_time() - began_s < SOON_S
     assert {status.state for status in auctioneer.status(map(str, range(1, last)))} == {"given_up"}
     end = auctioneer.status((str(last),))[0]  # the first ones have left the ledger
-    assert end.reason == f"Given up, because it waits for '{last - 1}', which is given up."
+    assert end.reason == f"Given up, because it waits for '{last - 1}', which is given up or cancelled."
 
 
 def test_many_jobs_that_expire_at_once_give_up_those_that_wait_for_them_soon(auctioneer):

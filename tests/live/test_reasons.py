@@ -14,7 +14,7 @@ from fleet.live.book import JobBook
 from fleet.live.job_rules import why_not_ready
 from fleet.live.journal import JobsAccepted
 from fleet.live.leases import expire
-from tests.live.records import awarded
+from tests.live.records import awarded, closed
 
 JOB = JobSpec(name="j", kind="hold", places=("bench",))
 NEAR = PlanQuote(plan=0, space="near", duration_s=10.0)
@@ -47,8 +47,11 @@ def bidding(*quotes: Quote, **more: Any) -> Bidding:
             "The policy lets it wait: it would end 101 min late; a could begin it.",
         ),
         (
-            bidding(quote("a"), quote("b", plans=(), reason="too far"), taken={"c": frozenset(["near"])}),
-            "It waits until c is out of the way.",
+            bidding(
+                quote("a"), quote("b", plans=(), reason="too far"),
+                taken={"c": frozenset(["near"])}, absent=frozenset(["c", "d"]),
+            ),
+            "It waits until c is out of the way. c is not present.",
         ),
         (
             bidding(quote("a"), quote("b", capacity=0), taken={"b": frozenset(["near"])}),
@@ -126,4 +129,6 @@ def test_a_lease_that_ends_while_the_auctioneer_is_stopped_is_not_blamed_on_its_
     book = JobBook().replay([JobsAccepted((JOB,)), awarded("w:j", "j")])
     book.attach(lambda *_: None, 100.0)
     assert expire(book, 100.0 + late_s, 5.0)
+    assert book.status_of(book.jobs["j"]).reason == reason
+    book.record(closed("w:j", "returned", 0, 6.0, "the award was revoked"))  # the arm knows no more
     assert book.status_of(book.jobs["j"]).reason == reason

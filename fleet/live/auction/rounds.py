@@ -66,6 +66,8 @@ class Bidding:
     taken: Mapping[str, frozenset[str]] = field(default_factory=dict[str, frozenset[str]])
     """Names of the spaces that each arm may take."""
     excludes: Excludes = no_conflicts
+    absent: frozenset[str] = frozenset()
+    """Arms that may take space and are not present."""
 
     def offer(self, arm: str, job: str, plan: int = 0) -> PlanQuote | None:
         """Return what an arm quotes for a plan of a job of the round; None if it is not open."""
@@ -229,6 +231,7 @@ def reason_to_wait(bidding: Bidding, job: str) -> str:
     plans = [(arm, plan) for arm in able.keys() & bidding.quotes for plan in able[arm]]
     in_way = {other for arm, plan in plans for other in bidding.in_the_way(arm, plan.space)}
     reasons = [f"It waits until {', '.join(sorted(in_way))} is out of the way."] if in_way else []
+    reasons += [f"{arm} is not present." for arm in sorted(in_way & bidding.absent)]
     taken = [f"{arm} {_why_without_capacity(bidding, arm)}" for arm in able if arm in bidding.full]
     reasons += [f"{', '.join(taken)}."] if taken else []
     return " ".join(reasons)[:MAX_REASON]
@@ -360,7 +363,7 @@ SCAN_S = 0.05
 """Real seconds between two checks for jobs that have become ready."""
 NO_JOB = JobSpec(name="space", kind="hold", places=("?",))
 """A job that no arm can do, to ask arms for their space before there was any job."""
-NOT_OFFERED = "It has not been offered yet: at most {} jobs are at a time, the oldest first."
+NOT_OFFERED = "It waits to be offered: at most {} jobs are offered at a time, the oldest first."
 
 
 class Rounds:
@@ -523,8 +526,9 @@ class Rounds:
             states=self.states,
             returned={entry.name: (len(entry.faults), entry.returned_s) for entry in entries if entry.returns},
             busy=self._book.busy_stations(),
-            taken=self._book.taken_space(),
+            taken=(taken := self._book.taken_space()),
             excludes=self._excludes,
+            absent=taken.keys() - self.present,
         )
         self._planned |= planned_jobs(quotes)
         self._notes |= {job.name: reason_to_wait(bidding, job.name) for job in jobs}

@@ -15,7 +15,10 @@ from fleet.live.monitor.snapshot import MAX_ALARMS
 LASTING = {
     "absent": "{} is absent: it has left, or its process hangs or has ended.",
     "silent": "{} does not reply: its process hangs or has ended, and no job is awarded.",
-    "space": "The space of {} stays closed to other arms, as it is not present.",
+    "space": (
+        "The space of {} stays closed to other arms, as it is not present. "
+        "Clear it once a person has seen that it is at home or removed, and is switched off."
+    ),
 }
 """Texts of alarms whose findings name a state of the moment, by kind."""
 HOLD_S = 5.0

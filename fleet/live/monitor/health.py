@@ -15,7 +15,7 @@ from fleet.live.monitor.snapshot import FRESH_S, STATUS_EVERY_S, ArmSnapshot, Fl
 
 REASONS = {
     "It is released at": "release", "It waits for": "predecessor", "are paused": "paused", "paused by": "paused",
-    "has not been offered": "queue", "has a break": "break", "are planning": "planning",
+    "waits to be offered": "queue", "has a break": "break", "are planning": "planning",
     "is above its warning limit": "hot", "is faulted": "faulted", "It waits until": "space",
     "No arm can do it": "no_arm", "The policy lets it wait": "policy", "Its place was in use": "place",
     "is in use": "place", "has a job": "busy",

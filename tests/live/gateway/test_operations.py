@@ -17,6 +17,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobStatus
 from fleet.bus.protocol.operator import Alarm
 from fleet.errors import FleetError
+from fleet.live.auction.rounds import NOT_OFFERED
 from fleet.live.monitor import alarms
 from fleet.live.monitor.snapshot import ArmSnapshot, AuctioneerSnapshot, FleetListener, FleetSnapshot
 from scenarios.live import webhooks
@@ -65,7 +66,7 @@ FLEET = FleetSnapshot(
     {"waiting": 2, "finished": 7},
     (
         JobStatus("j", "waiting", release_s=0.0, accepted_s=40.0, reason="It waits until b is out of the way."),
-        JobStatus("k", "waiting"),
+        JobStatus("k", "waiting", reason=NOT_OFFERED.format(16)),
     ),
     speed=60.0,
     changes={"finished": 5000},

@@ -196,8 +196,10 @@ def test_the_alarm_of_a_silence_begins_with_the_last_reply():
 
 def test_the_end_of_the_shift_raises_no_alarm_and_the_text_of_an_absence_stays_true():
     lasting = Finding("fault", "arm_1 publishes its state but shows no token", "absent", "arm_1")
-    (begun,) = AlarmList("m", {}).update([lasting], 5.0, 5.0)
+    closed = Finding("fault", "The space of arm_1 stays closed; 5 job(s) wait for it", "space", "arm_1")
+    begun, space = AlarmList("m", {}).update([lasting, closed], 5.0, 5.0)
     assert begun.what == "arm_1 is absent: it has left, or its process hangs or has ended."
+    assert space.what.startswith("The space of arm_1 stays closed to other arms, as it is not present. Clear it once")
     jobs = (JobStatus("a", "unfinished", shift_ended=True), JobStatus("b", "unfinished", reason="An arm stopped."))
     fleet = FleetSnapshot("f", (), (), {}, jobs)
     assert [finding.subject for finding in check_jobs(fleet)] == ["b"]

@@ -94,7 +94,7 @@ def test_a_small_screen_shows_the_arms_with_least_headroom_and_an_empty_fleet_sa
     assert "more with more headroom" in told
     told = shown(FleetSnapshot("f", (), (), {}, ()))
     assert "no auctioneer" in told
-    assert "jobs: none" in told
+    assert "jobs: unknown\nspace closed by: unknown" in told
 
 
 def test_ages_and_times_are_short():
