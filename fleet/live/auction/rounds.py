@@ -528,7 +528,7 @@ class Rounds:
             busy=self._book.busy_stations(),
             taken=(taken := self._book.taken_space()),
             excludes=self._excludes,
-            absent=taken.keys() - self.present,
+            absent=frozenset(taken.keys() - self.present),
         )
         self._planned |= planned_jobs(quotes)
         self._notes |= {job.name: reason_to_wait(bidding, job.name) for job in jobs}
