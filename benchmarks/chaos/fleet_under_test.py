@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -231,7 +231,7 @@ class JournalFiles:
         """Follow the journals of a folder, which need not exist yet."""
         self._folder = folder
         self._read_s: dict[Path, float] = {}
-        self._stamps: dict[Path, object] = {}
+        self._stamps: dict[Path, list[tuple[int, int]]] = {}
         self._ended: dict[str, set[tuple[str, str]]] = {}
         """Finished jobs with their awards, by arm."""
         self._named: dict[str, set[str]] = {}
@@ -242,7 +242,8 @@ class JournalFiles:
         for path in self._folder.glob("*.journal"):
             if path.stem != "auctioneer" and time.monotonic() >= self._read_s.get(path, 0.0) + every_s:
                 self._read_s[path] = time.monotonic()
-                for record in records_of(path, self._stamps):
+                before, self._stamps[path] = self._stamps.get(path), stamp_of(path)
+                for record in records_of(path) if self._stamps[path] != before else ():
                     if isinstance(record, Closed) and record.report.outcome == "finished":
                         self._ended.setdefault(path.stem, set()).add((record.report.job, record.report.award))
                     elif isinstance(record, JobsFinished):
@@ -260,20 +261,26 @@ class JournalFiles:
         return done
 
 
-def records_of(path: Path, stamps: dict[Path, object]) -> list[ArmRecord]:
-    """Return the records of an arm's journal by a copy, as its process has it open; none if it changes meanwhile.
+def _files_of(journal: Path) -> tuple[Path, Path]:
+    return journal, journal.with_name(f"{journal.name}-wal")
 
-    Args:
-        stamps: Sizes and times of the files at the last copy, by journal; none is made, or returned, of the same ones.
-    """
+
+def stamp_of(path: Path) -> list[tuple[int, int]]:
+    """Return size and time of each file of a journal."""
+    found: list[tuple[int, int]] = []
+    for each in _files_of(path):
+        with suppress(FileNotFoundError):
+            found.append(((status := each.stat()).st_size, status.st_mtime_ns))
+    return found
+
+
+def records_of(path: Path) -> list[ArmRecord]:
+    """Return the records of an arm's journal by a copy, as its process has it open; none if it changes meanwhile."""
     with tempfile.TemporaryDirectory() as folder:
         try:
-            there = [each for each in (path, path.with_name(f"{path.name}-wal")) if each.exists()]
-            before, stamps[path] = stamps.get(path), [(each.stat().st_size, each.stat().st_mtime_ns) for each in there]
-            if stamps[path] == before:
-                return []
-            for each in there:
-                shutil.copyfile(each, Path(folder) / each.name)
+            for each in _files_of(path):
+                if each.exists():
+                    shutil.copyfile(each, Path(folder) / each.name)
             with Journal[ArmRecord](Path(folder) / path.name, ArmRecord, durable=False) as journal:
                 return list(journal.records())
         except (JournalError, OSError):

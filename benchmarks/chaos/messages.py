@@ -92,7 +92,7 @@ def replayed_awards(fleet: Fleet) -> float:
 
 def awards_of(fleet: Fleet, arm: str) -> list[Award]:
     """Return the awards of an arm, by its journal."""
-    records = records_of(fleet.folder / "journals" / f"{arm}.journal", {})
+    records = records_of(fleet.folder / "journals" / f"{arm}.journal")
     return [record.award for record in records if isinstance(record, AwardAccepted)]
 
 

@@ -1,7 +1,8 @@
 """A simulated fleet: its processes, what its arms do, and the rules that hold at every moment.
 
 The last cycle of a job is done at most once; no two arms have one job; no two arms are away from home on plans that
-exclude each other; an accepted job stays known; who has granted an award keeps it while its arm counts a lease.
+exclude each other; an accepted job stays known; whoever has granted an award keeps the grant until the lease of the arm
+ends.
 """
 
 from collections.abc import Mapping
@@ -202,7 +203,7 @@ class Fleet:
             node = self.node(granter) if holder.real_s < end_s else None
             book = None if node is None else (node.work_source if self.alone else node).book
             if book is not None and name not in book.open:
-                raise Violation(f"'{granter}' has dropped '{name}', for which '{holder.name}' counts its lease.")
+                raise Violation(f"'{granter}' has no grant of '{name}', which '{holder.name}' still leases.")
 
     def _check_known(self) -> None:
         book = self.node(AUCTIONEER).book

@@ -179,8 +179,13 @@ class JobBook(TimedState[BookRecord]):
             counted_until_s: Real second until which the open grants count as leased.
             announce: Gets each change of a job, and each operator request.
         """
-        self._keep, self._announce = keep, announce
-        self.leases = {award: CountedLease(counted_until_s) for award in self.open}
+        self._keep, self._announce, self.leases = keep, announce, {}
+        self.lease_open_grants(counted_until_s)
+
+    def lease_open_grants(self, until_s: float) -> None:
+        """Have the open grants without a lease count as leased until this real second."""
+        for award in self.open:
+            self.leases.setdefault(award, CountedLease(until_s))
 
     def record(self, *records: BookRecord) -> None:
         """Write records, then apply them.

@@ -109,8 +109,8 @@ def _break_times(
         raise ScenarioError(f"{where}: '{missing[0]}' is missing; a break has begin and end.")
     daily = begin is not None and all(_is_clock(given[name]) for name in ("begin", "end"))
     if "weekdays" not in given and not daily:
+        tell = partial(_LOG.warning, "%s: %s.", where)
         try:
-            tell = partial(_LOG.warning, "%s: %s.", where)
             first_s, last_s = (seconds_of(given[name], begin, horizon_s, tell) for name in ("begin", "end"))
         except ValueError as error:
             raise ScenarioError(f"{where}: {error}.") from error

@@ -308,7 +308,7 @@ def test_a_time_of_day_that_summer_time_leaves_out_is_told(tmp_path):
 
 
 def test_a_time_of_day_that_occurs_twice_is_told(tmp_path, caplog):
-    for shift_begin, release, told in (
+    for shift_begin, release, warned in (
         ("2026-10-25T01:59:00", "2:00", True),
         ("2026-10-25T01:59:00", "2026-10-25T02:00", True),
         ("2026-10-25T01:59:00", "2026-10-25T02:00+02:00", False),
@@ -321,7 +321,7 @@ def test_a_time_of_day_that_occurs_twice_is_told(tmp_path, caplog):
         )
         assert drawn(small_table(tmp_path, text, begin), 0)[0].release_s == 60.0
         sentence = f"row 2, column release: '{release}' occurs twice, as summer time ends: 2026-10-25T02:00+02:00 is"
-        assert (sentence in caplog.text) == told
+        assert (sentence in caplog.text) == warned
     small_table(tmp_path, f"{SHORT}\na,hold,bench,,,,,,,\n", begin.removesuffix("+01:00"))
     assert "shift_begin = 2026-10-25 02:29:00 occurs twice, as summer time ends" in caplog.text
 

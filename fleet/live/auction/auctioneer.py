@@ -35,7 +35,7 @@ from fleet.live.epochs import adopted
 from fleet.live.job_rules import finish_s, joined_reasons
 from fleet.live.journal import JobsAccepted, Released
 from fleet.live.leases import Timing, clear, expire, progress, renewal, send_again, unanswered
-from fleet.live.records import MAX_REASON, CountedLease, JobSettled, ShiftEnded, outcome_of, requested_job
+from fleet.live.records import MAX_REASON, JobSettled, ShiftEnded, outcome_of, requested_job
 from fleet.live.space import Excludes, no_conflicts
 from fleet.live.steering import carry_out, controlled
 
@@ -153,8 +153,7 @@ class Auctioneer:
         if records := adopted(self.book, history):
             _LOG.warning("%d records of what '%s' has done and has are new to the journal.", len(records), history.arm)
             self.book.record(*records)
-            for award in self.book.open:
-                self.book.leases.setdefault(award, CountedLease(real_s + self._timing.counted_lease_s))
+            self.book.lease_open_grants(real_s + self._timing.counted_lease_s)
 
     def add_quote(self, quote: Quote) -> None:
         """Add a quote; after the last one that the round waits for, the next tick closes it."""

@@ -220,9 +220,9 @@ def reason_to_wait(bidding: Bidding, job: str) -> str:
     if not (estimates := bidding.estimates(job)):
         return "No arm has answered whether it can do it."
     able = {arm: each.plans for arm, each in estimates.items() if each.feasible}
-    if free := [arm for arm in able if bidding.plans(arm, job)]:
-        late = _lateness(bidding, job, (plan for arm in free for plan in bidding.plans(arm, job).values()))
-        return f"The policy lets it wait: {late}{', '.join(free)} could begin it."[:MAX_REASON]
+    if offered := {arm: plans for arm in able if (plans := bidding.plans(arm, job))}:
+        late = _lateness(bidding, job, (plan for plans in offered.values() for plan in plans.values()))
+        return f"The policy lets it wait: {late}{', '.join(offered)} could begin it."[:MAX_REASON]
     refusals = {arm: each.reason or "infeasible" for arm, each in estimates.items() if not each.feasible}
     if NOT_PLANNED in refusals.values():
         return "Arms are planning its motion."
@@ -240,7 +240,7 @@ def reason_to_wait(bidding: Bidding, job: str) -> str:
 def _lateness(bidding: Bidding, job: str, plans: Iterable[PlanQuote]) -> str:
     """By how much a job would end after its due date if it began now; "" if in time, or without such a date."""
     due_s = next((each.due_s for each in bidding.jobs if each.name == job), None)
-    takes_s = min((plan.duration_s or 0.0 for plan in plans), default=0.0)
+    takes_s = min(plan.duration_s or 0.0 for plan in plans)
     late_s = 0.0 if due_s is None else bidding.time_s + takes_s - due_s
     return f"it would end {late_s / 60:.0f} min late; " if late_s >= 60.0 else ""
 
@@ -517,6 +517,7 @@ class Rounds:
             for arm, quote in closing.quotes.items()
             if self._may_work(arm, closing)
         }
+        taken = self._book.taken_space()
         bidding = Bidding(
             closing.auction,
             time_s,
@@ -526,7 +527,7 @@ class Rounds:
             states=self.states,
             returned={entry.name: (len(entry.faults), entry.returned_s) for entry in entries if entry.returns},
             busy=self._book.busy_stations(),
-            taken=(taken := self._book.taken_space()),
+            taken=taken,
             excludes=self._excludes,
             absent=frozenset(taken.keys() - self.present),
         )

@@ -181,8 +181,7 @@ class Granter:
             JournalError: nothing is on disk.
         """
         self.book.record(*records)
-        for award in self.book.open:
-            self.book.leases.setdefault(award, CountedLease(real_s + self.timing.counted_lease_s))
+        self.book.lease_open_grants(real_s + self.timing.counted_lease_s)
 
     # Inside
 
