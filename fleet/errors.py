@@ -66,12 +66,21 @@ class LogError(FleetError):
 class Refused(FleetError):
     """A request is refused; its sender gets this sentence instead of a reply."""
 
+    temporary = False
+    """Whether the same request may be accepted later, without a change by its sender."""
+
+
+class RefusedForNow(Refused):
+    """A request is refused by a state that passes; repeated later, it may be accepted."""
+
+    temporary = True
+
 
 class JournalError(FleetError):
     """A journal is damaged, in use by another process, or not writable; names the file."""
 
 
-class JournalFull(JournalError, Refused):
+class JournalFull(JournalError, RefusedForNow):
     """No space for a record; the journal is unchanged, and a request that needs the record is refused."""
 
 

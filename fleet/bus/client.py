@@ -28,7 +28,7 @@ from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, c
 from fleet.bus.router import Connection
 from fleet.bus.security.access_control import RosterEntry, rights_by_role
 from fleet.bus.security.tls import participant_at
-from fleet.errors import BusError, Refused
+from fleet.errors import BusError, Refused, RefusedForNow
 
 _LOG = logging.getLogger(__name__)
 
@@ -72,6 +72,8 @@ class Replies(Generic[Message]):
     """By the key of the replier; a second reply under the same key gets a number, as `KEY (2)`."""
     refused: dict[str, str] = field(default_factory=dict)
     """Reasons by the key of the replier; "" for one that did not reply in time, whose key is not known."""
+    temporary: bool = False
+    """Whether a refusal is of a state that passes."""
     took_s: float = math.nan
     """Real seconds until they were complete."""
 
@@ -84,13 +86,13 @@ class Replies(Generic[Message]):
         """The first reply to a query of `key`.
 
         Raises:
-            Refused: there is none, and a participant refuses, with its reason.
+            Refused: there is none, and a participant refuses, with its reason; RefusedForNow by a state that passes.
             NoReply: there is neither.
         """
         for message in self.messages.values():
             return message
         for reason in self.refusals:
-            raise Refused(reason)
+            raise (RefusedForNow if self.temporary else Refused)(reason)
         raise NoReply(key, late=bool(self.refused))
 
 
@@ -452,7 +454,7 @@ class BusClient(Connection):
                 self.reject(f"query of '{own_key}': {error}")
                 reply = Refusal(str(error))
             except Refused as refused:
-                reply = Refusal(str(refused))
+                reply = Refusal(str(refused), refused.temporary)
             except AnotherReplies:
                 return
             query.reply(own_key, encode(reply), encoding=encoding(type(reply)))
@@ -510,6 +512,7 @@ class _PendingQuery(Generic[Reply]):
             return
         if isinstance(message, Refusal):
             _add(self._replies.refused, key, message.reason)
+            self._replies.temporary |= message.temporary
         else:
             _add(self._replies.messages, key, message)
             self._each(message)

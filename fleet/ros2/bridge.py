@@ -19,7 +19,7 @@ from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Ack, Award, JobEstimate, Quote, QuoteRequest
 from fleet.bus.protocol.messages import DifficultyScores, Info, MalformedMessage, State
-from fleet.errors import BusError, Refused
+from fleet.errors import BusError, RefusedForNow
 from fleet.live.arm.body import MotionMonitor
 from fleet.live.arm.node import WARNING_S, ClockSync, RateLimitedWarnings
 from fleet.live.clock import FleetClock
@@ -314,7 +314,7 @@ class Follower:
         now_s = time.monotonic()
         state = self._state(now_s)
         if state is None:
-            raise Refused(f"There is {self._readings.missing(now_s)}.")
+            raise RefusedForNow(f"There is {self._readings.missing(now_s)}.")
         estimates = tuple(JobEstimate(job.name, reason=self._refusal) for job in request.jobs)
         return Quote(
             arm=self._arm,

@@ -91,6 +91,8 @@ MAX_TABLE_BYTES = 1_000_000
 MAX_READERS, MAX_REQUESTS = 64, 16
 BODY_S, STUCK_S, HEARTBEAT_S = 10.0, 10.0, 15.0
 """Real seconds for a body to arrive, for a reader to receive, and between two heartbeats."""
+RETRY = {"Retry-After": "5"}
+"""Headers of a response where the same request may succeed later."""
 MAX_CONNECTIONS = 1000
 MAX_WAITING = 128
 """Connections without a complete request; the next one closes the oldest."""
@@ -324,7 +326,9 @@ def application(
 
     async def limited(request: Callable[[], Awaitable[Reply]]) -> Reply:
         if slots.locked():
-            raise HTTPException(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_REQUESTS} requests are waiting; try again.")
+            raise HTTPException(
+                HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_REQUESTS} requests are waiting; try again.", RETRY
+            )
         async with slots:
             return await request()
 
@@ -365,7 +369,8 @@ def application(
                 reply = replace(new, jobs=(*reply.jobs, *(with_cell(each, rows) for each in new.jobs)))
         except (BusError, Refused) as error:
             accepted = ", ".join(rows[each.job][0] for each in reply.jobs if each.accepted)
-            raise BusError(f"{error} Accepted before: {accepted or 'no job'}.") from error
+            kind = type(error) if isinstance(error, Refused) else BusError
+            raise kind(f"{error} Accepted before: {accepted or 'no job'}.") from error
         return json_response(reply)
 
     control = of_jobs("control", ControlRequest, Controlled)
@@ -393,10 +398,7 @@ def application(
 
     async def post_alarm(request: Request) -> Response:
         body = await read_body(request, AcknowledgeBody)
-        try:
-            return json_response(await bridge.acknowledge(body.alarm, body.by))
-        except Refused as error:
-            raise HTTPException(HTTPStatus.CONFLICT, str(error)) from error
+        return json_response(await bridge.acknowledge(body.alarm, body.by))
 
     async def ask_cell() -> Cell:
         return await ask(keys.of_jobs(bridge.fleet, "cell"), CellRequest(), Cell)
@@ -415,7 +417,7 @@ def application(
     async def events(request: Request) -> Response:
         if readers.closed or len(readers.connected) >= MAX_READERS:
             detail = f"{len(readers.connected)} readers are connected; try again later."
-            raise HTTPException(HTTPStatus.SERVICE_UNAVAILABLE, detail)
+            raise HTTPException(HTTPStatus.SERVICE_UNAVAILABLE, detail, RETRY)
         return EventStream(bridge.feed, readers, boot, request.headers.get("last-event-id", ""))
 
     async def contents(request: Request) -> Response:
@@ -554,8 +556,10 @@ def error_response(_: Request, error: Exception) -> Response:
     match error:
         case ScenarioError() | MalformedMessage():
             return problem_response(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
+        case Refused(temporary=False):
+            return problem_response(HTTPStatus.CONFLICT, str(error))
         case BusError() | Refused():
-            return problem_response(HTTPStatus.SERVICE_UNAVAILABLE, str(error))
+            return problem_response(HTTPStatus.SERVICE_UNAVAILABLE, str(error), RETRY)
         case HTTPException():
             return problem_response(HTTPStatus(error.status_code), str(error.detail), error.headers)
         case _:

@@ -173,6 +173,8 @@ class Refusal(msgspec.Struct, frozen=True):
 
     reason: str
     """A sentence."""
+    temporary: bool = False
+    """Whether the same request may be accepted later, without a change by its sender."""
 
 
 Message = TypeVar("Message", bound=msgspec.Struct)

@@ -52,7 +52,7 @@ from fleet.bus.protocol.keys import STATE_HZ
 from fleet.bus.protocol.messages import DifficultyScores, Info, State
 from fleet.bus.protocol.operator import ResetReply, ResetRequest
 from fleet.difficulty import known_temperatures
-from fleet.errors import BusError, Refused, printable
+from fleet.errors import BusError, Refused, RefusedForNow, printable
 from fleet.events import EVENTS_PER_BOOT, Event
 from fleet.live.arm.awards import ActiveAward, ArmHistory, AwardExecutor, FaultCleared
 from fleet.live.arm.body import Body
@@ -519,7 +519,7 @@ class ArmNode:
         if self._reading.mode != "faulted":
             return ResetReply(self._name, changed=False)
         if reason := self._body.clear_fault():
-            raise Refused(f"The fault of '{self._name}' is not cleared: {reason}.")
+            raise RefusedForNow(f"The fault of '{self._name}' is not cleared: {reason}.")
         self.executor.write(FaultCleared(request.by, self._body.time_s))
         self._cleared_by = request.by
         return ResetReply(self._name, changed=True)
@@ -572,7 +572,7 @@ class ArmNode:
 
     def _award(self, award: Award) -> Ack:
         if self.work_source.objection:
-            raise Refused(self.work_source.objection)
+            raise RefusedForNow(self.work_source.objection)
         return self.answer_award(award, time.monotonic())
 
     def answer_award(self, award: Award, real_s: float) -> Ack:

@@ -30,7 +30,7 @@ from fleet.bus.protocol.consensus import History, HistoryRequest
 from fleet.bus.protocol.keys import SESSION_LEASE_S
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
-from fleet.errors import BusError, JournalError, JournalFull, Refused
+from fleet.errors import BusError, JournalError, JournalFull, RefusedForNow
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.rounds import SCAN_S, Allocate
 from fleet.live.book import JobBook
@@ -275,12 +275,12 @@ class AuctionNode(JobDesk):
 
     def _check_alone(self, vain: str) -> None:
         if self.rivals:
-            raise Refused(f"{self._name_rivals()}: {vain} until one is stopped.")
+            raise RefusedForNow(f"{self._name_rivals()}: {vain} until one is stopped.")
 
     def _submit(self, submission: Submission) -> SubmissionReply:
         self._check_alone("no jobs are accepted")
         if self._epochs.objection:
-            raise Refused(self._epochs.objection)
+            raise RefusedForNow(self._epochs.objection)
         return self.auctioneer.submit(submission, *self._now())
 
     def _clear(self, request: ClearRequest) -> Cleared:

@@ -168,7 +168,7 @@ class AsyncBridge:
         try:
             return replies.first(key)
         except Refused as error:
-            raise Refused(f"The {replier(key)} refused: {error}") from error
+            raise type(error)(f"The {replier(key)} refused: {error}") from error
 
     async def acknowledge(self, alarm: str, by: str) -> Alarm:
         """Note that a person has seen an alarm. Raises Refused as `AlarmList.acknowledge`."""

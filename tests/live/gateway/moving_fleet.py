@@ -4,7 +4,7 @@ import math
 import time
 from contextlib import ExitStack
 
-from fleet.bus.client import BusClient, Refused
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import auction as bus
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.cell import Cell, CellArm, CellKind, CellPlace, CellRequest, Limit, PlannedWork
@@ -22,6 +22,7 @@ from fleet.bus.protocol.operator import (
     ResetRequest,
     Settle,
 )
+from fleet.errors import Refused, RefusedForNow
 from fleet.job import BOUNDS
 from tests.waiting import serving
 
@@ -174,7 +175,9 @@ class MovingFleet:
 
     def submit(self, request):
         if request.by == "disk full":
-            raise Refused("The journal has no room.")
+            raise RefusedForNow("The journal has no room.")
+        if request.by == "nobody":
+            raise Refused("There is no 'nobody'.")
         self.requests.append(request)
         for job in request.jobs:
             self.set(job.name, request.by, state="waiting", repetitions=job.repetitions)

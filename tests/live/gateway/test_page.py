@@ -19,7 +19,7 @@ import pytest
 from fleet.bus.protocol.auction import Admission, Status, SubmissionReply
 from fleet.bus.protocol.operator import Cancel, ControlRequest, Operation, Pause, ResetRequest, Resume
 from fleet.bus.router import Router
-from fleet.errors import Refused
+from fleet.errors import RefusedForNow
 from fleet.live.monitor.snapshot import FleetView
 from scenarios.live.fleet_processes import page_of
 from scenarios.live.gateway import FILES, MAX_BYTES, MAX_TABLE_BYTES, PAGE, LivePage, scene_of
@@ -233,6 +233,7 @@ def test_jobs_are_submitted_and_quoted(gateway, arm):
         ("POST", "/v4/jobs", b"\xff", {}, 422, "Not a"),
         ("POST", "/v4/jobs", {"jobs": [CRATE_JSON]}, {"Content-Type": "text/plain"}, 415, "application/json"),
         ("POST", "/v4/jobs", {"jobs": [CRATE_JSON], "by": "disk full"}, {}, 503, "no room"),
+        ("POST", "/v4/jobs", {"jobs": [CRATE_JSON], "by": "nobody"}, {}, 409, "There is no 'nobody'."),
         ("POST", "/v4/ask", {"jobs": []}, {}, 422, "length >= 1"),
         ("POST", "/v4/jobs", b" " * (MAX_BYTES + 1), {}, 413, "at most"),
         ("POST", "/v4/jobs", b" " * (MAX_TABLE_BYTES + 1), CSV, 413, "at most 1000000 bytes"),
@@ -283,7 +284,7 @@ def test_jobs_of_a_table_that_are_refused_are_named_by_row_and_what_was_accepted
     def submit(request, own=arm.submit):
         reply = own(request)
         if len(request.jobs) == 1:  # what waits is sent last
-            raise Refused("The journal has no room.")
+            raise RefusedForNow("The journal has no room.")
         stuck = Admission("j1", False, "It waits for 'no/one'.")
         return SubmissionReply("auctioneer", tuple(stuck if each.job == "j1" else each for each in reply.jobs))
 
