@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fleet.heat.motor import gen3_motors, thermal_data
-from fleet.robot import JOINTS, ThermalLimits
+from fleet.robot import JOINTS, ThermalLimits, half_turn
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -410,11 +410,6 @@ def _impossible_changes(time_s: Array, temp_c: Array) -> Iterator[BadReading]:
 def _steps(q: Array) -> Array:
     """Change of the angles by at most half a turn, rad, [row − 1, joint]."""
     return half_turn(np.diff(q, axis=0))
-
-
-def half_turn(angle: Array) -> Array:
-    """Angles within half a turn of zero, rad."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def _filled(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]:

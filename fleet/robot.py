@@ -159,6 +159,11 @@ def rotation(roll_pitch_yaw_deg: tuple[float, float, float]) -> np.ndarray:
     return about_z @ about_y @ about_x
 
 
+def half_turn(angle: np.ndarray) -> np.ndarray:
+    """Angles within half a turn of zero, rad."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
 def angles_deg(turned: np.ndarray) -> tuple[float, float, float]:
     """Roll, pitch, yaw of a rotation [3, 3], deg: the inverse of `rotation`. At a pitch of ±90° yaw is 0."""
     pitch = np.arctan2(-turned[2, 0], np.hypot(turned[0, 0], turned[1, 0]))

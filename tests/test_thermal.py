@@ -1,5 +1,6 @@
 """Motor and thermal network against closed forms, independent solvers, published figures and their own symmetries."""
 
+import math
 from dataclasses import replace
 from itertools import pairwise, repeat
 from pathlib import Path
@@ -380,6 +381,21 @@ def test_the_same_seed_makes_the_same_arm():
     np.testing.assert_array_equal(one_motors.copper_w_per_a2, same_motors.copper_w_per_a2)
     assert not np.allclose(one.laplacian, other.laplacian)
     assert not np.allclose(one_motors.idle_w, other_motors.idle_w)
+
+
+def test_an_arm_is_the_same_on_every_processor():
+    """The exponential of the C library, to the last digit: NumPy's differs with AVX-512, and keys hold the result."""
+    spread, wide = ThermalSpread(copper=0.2, idle=0.3), ThermalSpread(capacity=0.1)
+    for seed in range(30):
+        own, draws = np.random.default_rng(seed), np.random.default_rng(seed)
+        motors = spread_motors(MOTORS, spread, own)
+        copper, idle = ([math.exp(sd * x) for x in draws.standard_normal(JOINTS)] for sd in (0.2, 0.3))
+        assert motors.copper_w_per_a2.tolist() == (MOTORS.copper_w_per_a2 * copper).tolist()
+        assert motors.idle_w.tolist() == (MOTORS.idle_w * idle).tolist()
+        network = gen3_network(spread=wide, rng=own)
+        draws.standard_normal((2, 2, JOINTS))
+        factors = [math.exp(0.1 * x) for x in draws.standard_normal(2 * JOINTS)]
+        assert thermal_model(network).capacity.tolist() == (MODEL.capacity * factors).tolist()
 
 
 def test_spread_has_the_width_it_says():

@@ -10,6 +10,7 @@ Th + G_wh Tw + g Ta + P_h, stepped exactly for constant inputs. It is a reduced-
 Automatic Control 16, 1971) without correction: an initial error decays with the housings' time constants.
 """
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import repeat
@@ -109,8 +110,8 @@ def spread_motors(motors: Motors, spread: ThermalSpread, rng: np.random.Generato
     shape = motors.copper_w_per_a2.shape
     return replace(
         motors,
-        copper_w_per_a2=motors.copper_w_per_a2 * np.exp(spread.copper * rng.standard_normal(shape)),
-        idle_w=motors.idle_w * np.exp(spread.idle * rng.standard_normal(shape)),
+        copper_w_per_a2=motors.copper_w_per_a2 * _exp(spread.copper * rng.standard_normal(shape)),
+        idle_w=motors.idle_w * _exp(spread.idle * rng.standard_normal(shape)),
     )
 
 
@@ -120,7 +121,15 @@ def _factors(spread: ThermalSpread | None, rng: np.random.Generator | None) -> d
         return {name: np.ones((2, JOINTS)) for name in names}
     if rng is None:
         raise ValueError("A thermal spread needs an rng (got None).")
-    return {name: np.exp(getattr(spread, name) * rng.standard_normal((2, JOINTS))) for name in names}
+    return {name: _exp(getattr(spread, name) * rng.standard_normal((2, JOINTS))) for name in names}
+
+
+def _exp(values: Array) -> Array:
+    """`np.exp`, but equal on every processor: NumPy's has other last digits with AVX-512.
+
+    An arm's parameters are part of the keys of its cached models.
+    """
+    return np.array([math.exp(value) for value in values.flat]).reshape(values.shape)
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,8 +24,8 @@ from fleet.live.arm.body import MotionMonitor
 from fleet.live.arm.node import WARNING_S, ClockSync, RateLimitedWarnings
 from fleet.live.clock import FleetClock
 from fleet.live.monitor.snapshot import Recent
-from fleet.readings import TemperatureFilter, half_turn
-from fleet.robot import ThermalLimits
+from fleet.readings import TemperatureFilter
+from fleet.robot import ThermalLimits, half_turn
 from fleet.ros2.cdr import (
     DIAGNOSTICS,
     JOINT_STATE,

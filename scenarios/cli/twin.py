@@ -52,7 +52,6 @@ def identify_command(
     """
     from scenarios.prepare.twins import arms_of
     from twin.thermal.checkpoint import CARD, save
-    from twin.thermal.forecast import check_ambient
     from twin.thermal.identify import AMBIENT_C, identify
 
     if out is not None:
@@ -61,8 +60,6 @@ def identify_command(
     ambient_c = AMBIENT_C if ambient is None else ambient
     recordings = options.arm_recordings(log, arm, skip_damaged)
     arm = arm or arms_of(recordings)[0]
-    for each in recordings:
-        check_ambient(each, ambient_c)
     with progress_bar(kept="") as progress:
         progress("identifying", 0.0)
         network = identify(recordings, arm=arm, ambient_c=ambient_c)

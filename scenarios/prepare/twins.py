@@ -20,6 +20,7 @@ import numpy as np
 
 from fleet.arm.plan_cache import RANDOM_MOTIONS_VERSION
 from fleet.errors import CheckpointError, FleetError, nearest
+from fleet.fields import MAX_SEED, Option
 from fleet.files import cache_folder
 from fleet.heat.motor import Motors
 from fleet.heat.thermal import NODES, ThermalModel
@@ -332,8 +333,11 @@ def train_log(
         hold_out: Share of the cool recordings that are held out.
 
     Raises:
-        FleetError: a recording has no temperatures, nothing stayed cool, or the latent space of a joint collapsed.
+        FleetError: a recording has no temperatures, nothing stayed cool, the latent space of a joint collapsed, or the
+            seed is no integer from 0 to `MAX_SEED`.
     """
+    if problem := Option(help="", low=0, high=MAX_SEED, is_integer=True).problem("seed", seed):
+        raise FleetError(problem)
     check_recordings(recordings)
     blind = [recording.name for recording in recordings if recording.temp_c is None]
     if blind:

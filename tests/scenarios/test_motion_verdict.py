@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from fleet.errors import FleetError
 from scenarios.prepare.twins import train_log
 from tests.logs import COOL, RATE_HZ, TINY, WARM, logged
 from twin.logs.recording import cool_stretches
@@ -25,6 +26,9 @@ def test_a_twin_of_logs_is_calibrated_on_whole_recordings_that_it_was_not_traine
     cool = cool_stretches(rest, RATE_HZ, cool_c=40.0, joints=(0, 1, 2, 3))
     assert twin.data_hash == hash_records([stretch.profile for stretch in cool])
     assert train_log([*COOL[:5], WARM], TINY, 3, cool_c=40.0).calibration is None  # a third of 5 are too few
+    for seed, says in ((1.5, "seed must be an integer"), (-1, "seed must be 0 to")):
+        with pytest.raises(FleetError, match=says):
+            train_log(COOL, TINY, seed, cool_c=40.0)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from sklearn.metrics import brier_score_loss
 
 from benchmarks.paper.reliability import calibration_error
 from fleet.difficulty import KNOWN, SETTLING_S, known_temperatures
-from fleet.errors import CheckpointError, IdentificationError
+from fleet.errors import CheckpointError, FleetError, IdentificationError
 from fleet.heat.motor import friction_heat, gen3_motors, reference_current
 from fleet.heat.thermal import (
     HOUSING,
@@ -509,6 +509,8 @@ def test_arguments_that_make_no_sense_are_refused(rng):
     recording, _ = logged(nominal_heat_model(), rng, 6.0)
     with pytest.raises(ValueError, match="ambient_sd_k"):
         identify([recording], ambient_sd_k=-1.0)
+    with pytest.raises(FleetError, match="below the ambient temperature of 72 °C, which no powered motor can be"):
+        identify([recording], ambient_c=72.0)
     with pytest.raises(ValueError, match="Free parameters must be some of"):
         identify([recording], free=("copper",))
     without = replace(gen3_motors(), idle_w=np.zeros(JOINTS))

@@ -23,8 +23,8 @@ import pyarrow.parquet as pq
 
 from fleet.errors import LogError, nearest
 from fleet.files import decode_text
-from fleet.readings import clock_step, half_turn, judge, judge_plan, mounts_differ, repeats
-from fleet.robot import JOINTS
+from fleet.readings import clock_step, judge, judge_plan, mounts_differ, repeats
+from fleet.robot import JOINTS, half_turn
 from twin.logs.recording import GAP_S, READINGS, Recording
 
 Array = np.ndarray

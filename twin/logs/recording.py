@@ -9,6 +9,7 @@ import numpy as np
 from fleet import readings
 from fleet.errors import FleetError, IdentificationError
 from fleet.heat.motor import Motors, friction_heat, reference_current
+from fleet.robot import half_turn
 
 Array = np.ndarray
 
@@ -109,7 +110,7 @@ def interval_speed(recording: Recording) -> Array:
 
 def _speeds(recording: Recording) -> tuple[Array, Array]:
     """Mean of the measured speeds, >= 0, and signed change of position over each interval, rad/s, [time − 1, joint]."""
-    moved = (np.diff(recording.q, axis=0) + np.pi) % (2 * np.pi) - np.pi
+    moved = half_turn(np.diff(recording.q, axis=0))
     measured = (np.abs(recording.qd[1:]) + np.abs(recording.qd[:-1])) / 2.0
     return measured, moved / np.diff(recording.time_s)[:, None]
 

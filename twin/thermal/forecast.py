@@ -19,8 +19,7 @@ from fleet.errors import FleetError
 from fleet.heat.motor import Motors, magnet_factor
 from fleet.heat.thermal import HOUSING, WINDING, temperature_steps
 from fleet.motion import Drive
-from fleet.readings import half_turn
-from fleet.robot import JOINTS
+from fleet.robot import JOINTS, half_turn
 from twin.logs.recording import (
     HEAT_GAP_S,
     STEP_S,
@@ -38,6 +37,7 @@ from twin.thermal.identify import (
     Noise,
     ParameterVector,
     Problem,
+    check_ambient,
     nominal_heat_model,
     solve,
 )
@@ -70,8 +70,6 @@ MOST_SD = 4.0
 three times as large."""
 MOST_WAY_RAD = 0.2
 """Largest way from the end of a plan to its begin that repetitions may leave out."""
-BELOW_AMBIENT_K = 3.0
-"""By how much the coolest motor of a powered arm may read less than the ambient temperature."""
 LONGEST_S = 4 * 3600.0
 """Time for which longer runs of the same motion are simulated: temperatures are steady by then."""
 MOST_S = 7 * 86400.0
@@ -274,16 +272,6 @@ def _end_of(so_far: Recording, motors: Motors, ambient_c: float) -> tuple[HeatLo
         )
     check_ambient(late, ambient_c)
     return logs[-1], so_far.temp_c[-1]
-
-
-def check_ambient(log: Recording, ambient_c: float) -> None:
-    """Raise a FleetError if a motor temperature of a log is below its ambient temperature."""
-    coolest_c = np.inf if log.temp_c is None else float(log.temp_c.min(initial=np.inf))
-    if coolest_c < ambient_c - BELOW_AMBIENT_K:
-        raise FleetError(
-            f"The log '{log.name}' has a motor at {coolest_c:.1f} °C, below the ambient temperature of {ambient_c:g} "
-            "°C, which no powered motor can be. State the ambient temperature of the log in °C (--ambient)."
-        )
 
 
 def _cycle_of(plan: Recording, motors: Motors) -> HeatLog:

@@ -20,7 +20,7 @@ import msgspec
 import networkx as nx
 import numpy as np
 
-from fleet.errors import IdentificationError
+from fleet.errors import FleetError, IdentificationError
 from fleet.heat.motor import Motors, copper_loss, gen3_motors, magnet_factor, thermal_data
 from fleet.heat.thermal import (
     HOUSING,
@@ -388,6 +388,8 @@ class Problem:
 
 AMBIENT_C = 22.0
 """Default ambient temperature; that of the public Gen3 logs."""
+BELOW_AMBIENT_K = 3.0
+"""By how much the coolest motor of a powered arm may read less than the ambient temperature."""
 INFORMED = 0.9
 """A parameter is informed if its standard deviation is below this share of the prior's."""
 
@@ -494,13 +496,15 @@ def identify(
     Args:
         nominal: Centre of the prior; a Gen3 in still air unless given.
         ambient_c: Ambient temperature.
-        ambient_sd_k: Its standard deviation from recording to recording, by default that of rooms; 0 if it was
-            measured. Differences between recordings are attributed to it, not to the arm.
+        ambient_sd_k: Its standard deviation from recording to recording, 0 if it was measured. By default that of
+            rooms, and motors that are cooler than the ambient temperature are refused. Differences between recordings
+            are attributed to it, not to the arm.
         free: Names of `twin.thermal.identify.PRIOR_SD`; the others keep their nominal values.
 
     Raises:
         IdentificationError: the recordings are insufficient: none, wrong number of joints, no temperatures, too
             short, no motor that warms or cools, no current.
+        FleetError: see `check_ambient`.
     """
     check_recordings(recordings)
     nominal = nominal or nominal_heat_model()
@@ -508,6 +512,9 @@ def identify(
     if sd_k < 0:
         raise ValueError(f"ambient_sd_k must be >= 0 (got {sd_k}).")
     _check_recordings(recordings)
+    if ambient_sd_k is None:
+        for recording in recordings:
+            check_ambient(recording, ambient_c)
     source = source_of(recordings)
     logs = [log for r in recordings for log in heat_logs(r, nominal.motors, source, step_s=step_s)]
     _check_logs(logs, nominal)
@@ -601,6 +608,16 @@ def _check_recordings(recordings: Sequence[Recording]) -> None:
                 f"Recording '{recording.name}' has no motor temperatures. Record temperature_motor of every joint "
                 "(Kortex ActuatorFeedback), or leave this recording out."
             )
+
+
+def check_ambient(log: Recording, ambient_c: float) -> None:
+    """Raise a FleetError if a motor temperature of a log is below its ambient temperature."""
+    coolest_c = np.inf if log.temp_c is None else float(log.temp_c.min(initial=np.inf))
+    if coolest_c < ambient_c - BELOW_AMBIENT_K:
+        raise FleetError(
+            f"The log '{log.name}' has a motor at {coolest_c:.1f} °C, below the ambient temperature of {ambient_c:g} "
+            "°C, which no powered motor can be. State the ambient temperature of the log in °C (--ambient)."
+        )
 
 
 def _check_logs(logs: Sequence[HeatLog], nominal: HeatModel) -> None:
