@@ -9,7 +9,7 @@ from msgspec import structs
 from fleet.bus.protocol.auction import NOT_PLANNED, JobEstimate, JobSpec, PlanQuote, Quote, QuoteRequest
 from fleet.bus.protocol.messages import State
 from fleet.live.auction.auctioneer import Auctioneer
-from fleet.live.auction.rounds import Bidding, reason_to_wait
+from fleet.live.auction.rounds import Assignment, Bidding, reason_to_wait
 from fleet.live.book import JobBook
 from fleet.live.job_rules import why_not_ready
 from fleet.live.journal import JobsAccepted
@@ -76,6 +76,27 @@ def bidding(*quotes: Quote, **more: Any) -> Bidding:
 )  # fmt: skip
 def test_the_reason_names_what_is_in_the_way(given, expected) -> None:
     assert reason_to_wait(given, "j") == expected
+
+
+def test_a_job_that_is_passed_over_for_another_names_what_that_takes() -> None:
+    """The same round awards `k` to an arm, or at a station or in a space, that `j` needs."""
+
+    def of_k(plan: PlanQuote) -> JobEstimate:
+        return JobEstimate("k", (plan,))
+
+    both = [structs.replace(each, estimates=(*each.estimates, of_k(NEAR))) for each in (quote("a"), quote("b"))]
+    far = PlanQuote(plan=1, space="far", duration_s=10.0)
+    k = JobSpec(name="k", kind="hold", places=("rack",))
+
+    def why(*quotes: Quote, plan: int = 0, job: JobSpec = k) -> str:
+        given = replace(bidding(*quotes), jobs=(JOB, job))
+        return reason_to_wait(given.after({"k": Assignment("a", plan)}), "j")
+
+    assert why(both[0]) == "a has a job."
+    assert why(*both) == "It waits until a is out of the way. a has a job."
+    apart = structs.replace(both[0], estimates=(JobEstimate("j", (NEAR,)), of_k(far)))
+    assert why(apart, both[1], plan=1) == "The policy lets it wait: b could begin it."
+    assert why(apart, both[1], plan=1, job=structs.replace(k, places=("bench",))).startswith("Its place was in use")
 
 
 def test_a_job_that_cannot_be_begun_yet_says_why() -> None:

@@ -5,6 +5,7 @@ Space in an auction: what quotes say about it, and which estimates it closes.
 Rounds of an auction: which jobs are offered when, to whom, and what is awarded.
 """
 
+import dataclasses
 import logging
 import math
 from collections import defaultdict
@@ -116,6 +117,18 @@ class Bidding:
     @cached_property
     def _in_the_way(self) -> dict[tuple[str, str | None], tuple[str, ...]]:
         return {}
+
+    def after(self, allocation: Mapping[str, "Assignment"]) -> "Bidding":
+        """Return what is left once these jobs are awarded: their arms, stations and spaces are taken."""
+        winners = {arm: self.offer(arm, job, plan) for job, (arm, plan) in allocation.items()}
+        spaces = {arm: frozenset([(offer and offer.space) or ANYWHERE]) for arm, offer in winners.items()}
+        return dataclasses.replace(
+            self,
+            quotes={arm: quote for arm, quote in self.quotes.items() if arm not in winners},
+            full={**self.full, **{arm: self.quotes[arm] for arm in winners}},
+            busy=self.busy.union(*(job.stations for job in self.jobs if job.name in allocation)),
+            taken={**self.taken, **spaces},
+        )
 
 
 class Choice(NamedTuple):
@@ -532,13 +545,14 @@ class Rounds:
             absent=frozenset(taken.keys() - self.present),
         )
         self._planned |= planned_jobs(quotes)
-        self._notes |= {job.name: reason_to_wait(bidding, job.name) for job in jobs}
         allocation = drop_invalid(bidding, self.allocate(bidding)) if bidding.quotes and jobs else {}
         try:
             self._award(bidding, allocation, real_s, time_s)
         except JournalFull as error:
             _LOG.error("Nothing is awarded: %s", error)
             allocation = {}
+        left = bidding.after(allocation)
+        self._notes |= {job.name: reason_to_wait(left, job.name) for job in jobs if job.name not in allocation}
         if allocation:
             self._scan_s, self._pause_s = -math.inf, self._timing.pause_s[0]
         else:
