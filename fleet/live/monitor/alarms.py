@@ -23,8 +23,9 @@ LASTING = {
 """Texts of alarms whose findings name a state of the moment, by kind."""
 HOLD_S = 5.0
 """Real seconds without the finding after which an alarm ends: a finding that comes and goes raises one alarm."""
-
-
+BEGIN_S = {"absent": 3.0, "space": 3.0}
+"""Real seconds that a finding of these kinds must last before it raises an alarm: every arm is absent for a moment
+while the router restarts."""
 OF_FLEET = ("no_progress", "webhook")
 """Kinds of alarms whose subject is neither arm nor job: they end with their finding, whoever is heard."""
 
@@ -50,6 +51,8 @@ class AlarmList:
         self.monitor, self.alarms = monitor, alarms
         self._found_s: dict[str, float] = {}
         """Real second at which this monitor last had the finding of an alarm, by name; of those that it may end."""
+        self._first_s: dict[str, float] = {}
+        """Real second since which this monitor has had each present finding, by the name of its alarm."""
         self._number = max((alarm.number for alarm in kept if alarm.monitor == monitor), default=0)
         for name, alarm in {alarm.alarm: alarm for alarm in kept}.items():
             if alarm.monitor == monitor:
@@ -84,14 +87,21 @@ class AlarmList:
             speed: Fleet seconds per real second.
         """
         changed: list[Alarm] = []
+        named: dict[str, Finding] = {}
         for finding in findings:
-            name = alarm_name(finding.kind, finding.subject)
-            if not finding.kind or (name not in self._found_s and len(self._found_s) >= MAX_ALARMS // 2):
+            if finding.kind:
+                named.setdefault(alarm_name(finding.kind, finding.subject), finding)
+        self._first_s = {name: self._first_s.get(name, real_s) for name in named}
+        for name, finding in named.items():
+            if name not in self._found_s and len(self._found_s) >= MAX_ALARMS // 2:
+                continue
+            lasts_s, lasting = real_s - self._first_s[name], name in self.alarms and self.alarms[name].ended_s is None
+            if not lasting and lasts_s < BEGIN_S.get(finding.kind, 0.0):
                 continue
             self._found_s[name] = real_s
-            if name not in self.alarms or self.alarms[name].ended_s is not None:
+            if not lasting:
                 what = LASTING.get(finding.kind, finding.what).format(finding.subject)
-                began_s = max(0.0, time_s - speed * finding.since_s)
+                began_s = max(0.0, time_s - speed * max(lasts_s, finding.since_s))
                 alarm = Alarm(self.monitor, 0, time_s, name, finding.kind, what, finding.subject, began_s)
                 changed.append(self._change(alarm, time_s))
         for name, found_s in list(self._found_s.items()):

@@ -194,10 +194,17 @@ def test_the_alarm_of_a_silence_begins_with_the_last_reply():
     assert (alarm.kind, alarm.subject, alarm.time_s, alarm.began_s) == ("silent", "au", 2000.0, 800.0)
 
 
-def test_the_end_of_the_shift_raises_no_alarm_and_the_text_of_an_absence_stays_true():
+def test_an_absence_raises_an_alarm_once_it_lasts_and_the_end_of_the_shift_raises_none():
     lasting = Finding("fault", "arm_1 publishes its state but shows no token", "absent", "arm_1")
     closed = Finding("fault", "The space of arm_1 stays closed; 5 job(s) wait for it", "space", "arm_1")
-    begun, space = AlarmList("m", {}).update([lasting, closed], 5.0, 5.0)
+    alarms = AlarmList("m", {})
+    for real_s in (0.0, 1.0, 2.5):  # as while a router restarts
+        assert alarms.update([lasting, closed], 300.0 + 60 * real_s, real_s, speed=60.0) == []
+    assert alarms.update([], 480.0, 3.0) == []
+    for real_s in (5.0, 7.0):
+        assert alarms.update([lasting, closed], 300.0 + 60 * real_s, real_s, speed=60.0) == []
+    begun, space = alarms.update([lasting, closed], 780.0, 8.0, speed=60.0)
+    assert (begun.began_s, space.began_s) == (600.0, 600.0)
     assert begun.what == "arm_1 is absent: it has left, or its process hangs or has ended."
     assert space.what.startswith("The space of arm_1 stays closed to other arms, as it is not present. Clear it once")
     jobs = (JobStatus("a", "unfinished", shift_ended=True), JobStatus("b", "unfinished", reason="An arm stopped."))
