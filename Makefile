@@ -9,6 +9,9 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --no-com
 UV := $(shell command -v uv 2>/dev/null)
 GOAL := $(or $(firstword $(MAKECMDGOALS)),demo)
 
+# The demo and the tests start many processes; without compiled files each of them compiles all that it imports.
+unexport PYTHONDONTWRITEBYTECODE
+
 # Each trainer has its own environment, because their packages conflict. So do the environments that benchmarks/env.py
 # compares with.
 PINNED := $(sort $(basename $(notdir $(wildcard constraints/*.txt))))

@@ -276,7 +276,7 @@ class World:
             return
         self.after(self.delay_s(), self._arrive, sender, receiver, receiver.boot, what, arguments)
         if self.rng.random() < self.doubling:
-            later_s = self.delay_s() * self.rng.choice([1.0, 10.0, 100.0])
+            later_s = self.delay_s() * self.rng.choice([1.0, 10.0, 100.0, 1000.0])
             self.after(later_s, self._arrive, sender, receiver, receiver.boot, what, arguments)
 
     def _arrive(self, sender: Process, receiver: Process, boot: int, what: Callable[..., None], arguments: Any) -> None:
