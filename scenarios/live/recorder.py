@@ -25,7 +25,7 @@ from fleet.bus.protocol.auction import ArmEvent, Result
 from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.keys import HISTORY
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import Alarm, Operation
+from fleet.bus.protocol.operator import ALARMS_PER_START, Alarm, Operation
 from fleet.errors import BusError, FleetError
 from fleet.events import EVENTS_PER_BOOT
 from fleet.files import atomic_path
@@ -106,7 +106,8 @@ def series_of(message: Message) -> Series:
         case Operation():
             return Series(f"operations of {message.auctioneer}", message.number, message.epoch, 0, True)
         case Alarm():
-            return Series(f"alarms of {message.monitor}", message.number, "", 1, False)
+            first = message.number // ALARMS_PER_START * ALARMS_PER_START + 1
+            return Series(f"alarms of {message.monitor}", message.number, "", first, False)
 
 
 class Recorder:

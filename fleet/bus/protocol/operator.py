@@ -137,6 +137,10 @@ class Operation(FiniteStruct, frozen=True):
     """With `redo`, without an auctioneer: the awards of the job whose last cycle was not done."""
 
 
+ALARMS_PER_START = 100_000
+"""The number of an alarm's message is this times the Unix second at which its monitor started, plus a count."""
+
+
 class Alarm(FiniteStruct, frozen=True):
     """Published under `monitor/{monitor}/alarm`: an alarm began, ended, or was acknowledged. The last message of an
     alarm has its state."""
@@ -144,7 +148,7 @@ class Alarm(FiniteStruct, frozen=True):
     monitor: Name
     """Who raised it, for example a gateway."""
     number: Count
-    """Counts the messages of this monitor since its start."""
+    """Counts the messages of this monitor; after a start it continues at a higher multiple of 10⁵, plus 1."""
     time_s: Number
     """Fleet time of this change."""
     alarm: Name

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 
 from msgspec.structs import replace
 
-from fleet.bus.protocol.operator import Alarm
+from fleet.bus.protocol.operator import ALARMS_PER_START, Alarm
 from fleet.errors import Refused
 from fleet.live.monitor.health import Finding
 from fleet.live.monitor.snapshot import MAX_ALARMS
@@ -42,10 +42,13 @@ class AlarmList:
         alarms: By name, the most recently changed last; those of other monitors too.
     """
 
-    def __init__(self, monitor: str, alarms: MutableMapping[str, Alarm], kept: Sequence[Alarm] = ()) -> None:
+    def __init__(
+        self, monitor: str, alarms: MutableMapping[str, Alarm], kept: Sequence[Alarm] = (), *, start_s: float = 0.0
+    ) -> None:
         """Begin with the alarms of a recording, in the order of their messages.
 
         Args:
+            start_s: Unix time: the numbers of a later start are higher, also in a fleet whose time begins anew.
             alarms: Keeps the last message of every alarm; whoever receives those of other monitors adds them.
         """
         self.monitor, self.alarms = monitor, alarms
@@ -53,7 +56,8 @@ class AlarmList:
         """Real second at which this monitor last had the finding of an alarm, by name; of those that it may end."""
         self._first_s: dict[str, float] = {}
         """Real second since which this monitor has had each present finding, by the name of its alarm."""
-        self._number = max((alarm.number for alarm in kept if alarm.monitor == monitor), default=0)
+        numbers = (alarm.number for alarm in kept if alarm.monitor == monitor)
+        self._number = max(int(start_s) * ALARMS_PER_START, *numbers, 0)
         for name, alarm in {alarm.alarm: alarm for alarm in kept}.items():
             if alarm.monitor == monitor:
                 self.alarms[name] = alarm

@@ -132,7 +132,7 @@ class AsyncBridge:
         self._listener = FleetListener(link, on_message=self._message, on_presence=self._presence)
         self._loop: asyncio.AbstractEventLoop | None = None
         name = link.participant or monitor
-        self._alarms, self._on_alarm = AlarmList(name, self._listener.view.alarms, kept), on_alarm
+        self._alarms, self._on_alarm = AlarmList(name, self._listener.view.alarms, kept, start_s=time.time()), on_alarm
         self._more_findings = more_findings
         self._publish = link.publisher(keys.build(self.fleet, "monitor", "alarm", name), Alarm)
         link.declare_token(keys.build(self.fleet, "monitor", "alive", name))

@@ -14,6 +14,8 @@ from fleet.errors import Refused
 from fleet.live.monitor.alarms import HOLD_S, AlarmList
 from fleet.live.monitor.health import Finding, check_jobs, check_replies
 from fleet.live.monitor.snapshot import MAX_ALARMS, FleetSnapshot, FleetView
+from scenarios.live.recorder import Recorder
+from scenarios.live.recording import alarms_of
 from tests.live.monitor.messages import state
 
 HOT = Finding("warning", "a is faulted.", "fault", "a")
@@ -52,6 +54,24 @@ def test_a_restart_continues_the_alarms_of_its_messages():
     for name, by, reason in (("none", "ann", "no alarm 'none'"), (ended.alarm, "  ", "name of a person")):
         with pytest.raises(Refused, match=reason):
             again.acknowledge(name, by, 31.0, NOON)
+
+
+def test_a_recording_keeps_the_alarms_of_a_gateway_that_starts_again_beside_a_new_fleet(tmp_path):
+    """Fleet time begins anew, the gateway knows nothing of its last start, and no alarm is missing or dropped."""
+    recorder = Recorder.open(tmp_path, "f")
+    sent = [
+        change
+        for start_s, time_s in ((1.76e9, 500.0), (1.76e9 + 9, 0.0))
+        for alarms in [AlarmList("gateway", {}, start_s=start_s)]
+        for step in (0, 1)
+        for change in alarms.update([HOT, Finding("fault", "no one", "no_progress", str(step))], time_s + step, step)
+    ]
+    for change in sent:
+        recorder.add("gateway", change)
+    recorder.write(status="finished")
+    assert len(sent) == 6
+    assert len(alarms_of(tmp_path)) == 6
+    assert not recorder.missing
 
 
 def test_the_list_is_bounded_and_keeps_what_lasts():
