@@ -2,11 +2,9 @@
 
 import json
 import math
-from io import StringIO
 
 import numpy as np
 import pytest
-from rich.console import Console
 from scipy.integrate import solve_ivp
 from typer.testing import CliRunner
 
@@ -15,7 +13,7 @@ from fleet.heat.motor import gen3_motors, reference_current
 from fleet.heat.thermal import NODES, drive_heat, gen3_network, thermal_model
 from fleet.robot import JOINTS
 from scenarios.cli.main import app
-from scenarios.motion.hold import LIMITS_C, as_json, as_table, courses, hold
+from scenarios.motion.hold import LIMITS_C, as_json, courses, hold
 
 J2, J4 = 1, 3
 
@@ -90,16 +88,8 @@ def test_times_agree_with_a_general_ode_solver_to_a_thousandth(posture, kg, star
     assert course.t75_min[J2] == pytest.approx(solved.t_events[1][0] / 60.0, rel=0.001)
 
 
-def test_more_payload_is_never_slower_to_warn():
-    loads_kg = (0.8, 1.0, 1.2, 2.0, 4.0, 6.0, 8.0)
-    times = [hold(kg, "outstretched", beyond_rating=True).cold.t60_min[J2] for kg in loads_kg]
-    minutes = [math.inf if t is None else t for t in times]
-    assert minutes == sorted(minutes, reverse=True)
-    assert minutes[0] == math.inf > 2.0 > minutes[-1]
-
-
 def test_a_limit_is_passed_exactly_when_the_arm_settles_above_it():
-    for kg in (0.6, 0.8, 0.85, 0.9, 1.0, 1.8):
+    for kg in (0.8, 0.85, 0.9, 1.8):
         result = hold(kg, "outstretched")
         for course in (result.cold, result.idle_warm):
             for limit_c, times in zip(LIMITS_C, (course.t60_min, course.t75_min), strict=True):
@@ -128,59 +118,40 @@ def test_a_start_above_the_limit_passes_at_once():
     assert hot.t60_min == (0.0,) * JOINTS
 
 
-def test_better_cooling_buys_time_and_a_tool_costs_it():
-    base = hold(3.0).cold.t75_min[J2]
-    forced = hold(3.0, cooling="forced_air").cold.t75_min[J2]
-    tool = hold(2.0, tool_kg=1.0).cold
-    assert base is not None
-    assert forced is None or forced > base
-    assert tool.torque_nm == hold(3.0).cold.torque_nm  # Both are point masses at the flange.
-
-
-def test_a_posture_in_degrees_is_the_posture_by_name():
-    assert hold(3.0, "0,90,0,0,0,0,0").cold.torque_nm == pytest.approx(
-        hold(3.0, "outstretched").cold.torque_nm, abs=1e-3
-    )
+def test_better_cooling_buys_time_and_a_tool_weighs_as_a_payload():
+    base, forced = hold(3.0).cold, hold(3.0, cooling="forced_air").cold
+    assert (forced.t75_min[J2] or math.inf) > (base.t75_min[J2] or math.inf)
+    assert hold(2.0, tool_kg=1.0).cold.torque_nm == base.torque_nm  # both are point masses at the flange
+    assert hold(3.0, "0,90,0,0,0,0,0").cold.torque_nm == pytest.approx(base.torque_nm, abs=1e-3)  # outstretched
 
 
 def test_json_has_lists_of_seven_and_nulls():
     printed = run("--hold", "3", "--posture", "outstretched", "--ambient", "25", "--json")
-    assert printed.exit_code == 0
     data = json.loads(printed.stdout)
+    assert data == as_json(hold(3.0, "outstretched", 25.0))
     assert (data["payload"], data["posture"], data["ambient_c"]) == (3.0, "outstretched", 25.0)
-    assert "55 °C" in data["note"]
-    assert "extrapolates" in data["note"]
     for start in ("cold", "idle_warm"):
-        assert set(data[start]) == {"t60_min", "t75_min", "steady_c", "torque_nm", "current_a"}
         assert all(len(values) == JOINTS for values in data[start].values())
         assert data[start]["t60_min"][0] is None
         assert data[start]["t75_min"][J2] > data[start]["t60_min"][J2] > 0
-    assert data == as_json(hold(3.0, "outstretched", 25.0))
 
 
-def test_table_names_every_joint_and_says_where_it_extrapolates():
-    printed = run("--hold", "4")
+def test_the_table_has_every_joint_in_eighty_columns_and_states_where_it_extrapolates():
+    printed = run("--hold", "4", "--posture", "0,90,0,0,0,0,0")
     assert printed.exit_code == 0
     assert [line[0] for line in printed.stdout.splitlines() if line[:1].isdigit()] == list("1234567")
+    assert max(len(line) for line in printed.stdout.splitlines()) <= 80
+    assert "…" not in printed.stdout
     text = " ".join(printed.stdout.split())
     assert "Above 55 °C the model extrapolates" in text
     assert "5.5 | 2.7" in text
     assert "12.7 | 6.5" in text
 
 
-def test_table_fits_a_terminal():
-    console = Console(width=80, file=StringIO())
-    with console.capture() as printed:
-        console.print(as_table(hold(4.0, "0,90,0,0,0,0,0")))
-    assert max(len(line) for line in printed.get().splitlines()) <= 80
-    assert "…" not in printed.get()
-
-
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
         (["--hold", "0", "--posture", "outstreched"], "did you mean 'outstretched'?"),
-        (["--hold", "0", "--posture", ""], "Allowed: home"),
         (["--hold", "0", "--posture", "1,2,3"], "7 comma-separated angles"),
         (["--hold", "0", "--posture", "0,nan,0,0,0,0,0"], "7 comma-separated angles"),
         (["--hold", "0", "--posture", "0,130,0,0,0,0,0"], "Joint 2 turns from"),
@@ -195,16 +166,6 @@ def test_a_hold_that_cannot_be_is_refused(arguments, says):
     assert isinstance(answer.exception, FleetError)
     assert says in str(answer.exception)
     assert answer.stdout == ""
-
-
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [("--hold", -1), ("--hold", math.nan), ("--hold", math.inf), ("--tool-kg", -0.1), ("--ambient", math.nan)],
-)
-def test_a_value_out_of_range_is_refused(option, value):
-    answer = run("--hold", "1", option, str(value))
-    assert answer.exit_code != 0
-    assert option in f"{answer.stderr}{answer.exception}"
 
 
 def test_a_load_beyond_the_rating_is_computed_on_request():

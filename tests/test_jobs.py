@@ -16,7 +16,7 @@ from scipy import stats
 from fleet.arrivals import Arrivals, arrival_table, sample_arrivals, scale_rate
 from fleet.bus.protocol.auction import JobSpec, Submission
 from fleet.bus.protocol.messages import decode
-from fleet.errors import FleetError, ScenarioError
+from fleet.errors import FleetError
 from fleet.jit import kernel
 from fleet.job import Job, Place, Work
 from fleet.robot import Mount
@@ -35,10 +35,10 @@ def sample(table, stream, key, out):
     return sample_arrivals(table, stream, key, out)
 
 
-def release_times(stream: Arrivals, horizon_s: float, seed: int = 0) -> np.ndarray:
+def release_times(stream: Arrivals, horizon_s: float, seed: int = 0, room: int = 200_000) -> np.ndarray:
     """The arrivals of the second of three streams."""
     table = arrival_table([Arrivals(kind="batch", count=2), stream, Arrivals(kind="trace", times_s=(1.0,))], horizon_s)
-    key, out = np.uint64(key_of(np.random.SeedSequence(seed))), np.full(200_000, np.nan)
+    key, out = np.uint64(key_of(np.random.SeedSequence(seed))), np.full(room, np.nan)
     count = sample.chosen()(table, 1, key, out)
     assert np.isnan(out[count:]).all()
     if count:
@@ -48,7 +48,7 @@ def release_times(stream: Arrivals, horizon_s: float, seed: int = 0) -> np.ndarr
 
 def test_poisson_counts_have_the_mean_and_the_spread_of_theory() -> None:
     stream, shifts = Arrivals(kind="poisson", every_s=600.0), 4000
-    counts = np.array([len(release_times(stream, HORIZON_S, s)) for s in range(shifts)])
+    counts = np.array([len(release_times(stream, HORIZON_S, s, room=200)) for s in range(shifts)])
     mean = HORIZON_S / 600.0
     # The mean of n counts has the deviation √(μ/n); their variance, μ √(2/n + 1/(μ n)). Four deviations each.
     assert counts.mean() == pytest.approx(mean, abs=4 * np.sqrt(mean / shifts))
@@ -84,10 +84,7 @@ def test_poisson_arrivals_are_in_order_and_inside(every_s, start_s, length_s, ho
         (Arrivals(kind="batch", count=2, start_s=10.0, every_s=40.0), [10.0, 10.0, 50.0, 50.0, 90.0, 90.0]),
         (Arrivals(kind="batch", count=1, start_s=100.0), []),
         (Arrivals(kind="batch", count=1, start_s=99.0), [99.0]),
-        (Arrivals(kind="batch", count=1, start_s=200.0, every_s=5.0), []),
         (Arrivals(kind="trace", times_s=(0.0, 3.0, 3.0, 99.5, 100.0, 250.0)), [0.0, 3.0, 3.0, 99.5]),
-        (Arrivals(kind="trace", times_s=()), []),
-        (Arrivals(kind="poisson", every_s=5.0, start_s=100.0), []),
         (Arrivals(kind="poisson", every_s=5.0, start_s=300.0), []),
     ],
 )
@@ -97,7 +94,7 @@ def test_arrivals_stop_before_the_horizon(stream, expected) -> None:
 
 def test_a_scaled_stream_arrives_more_often() -> None:
     stream, shifts = Arrivals(kind="poisson", every_s=600.0, start_s=10.0), 2000
-    counts = [len(release_times(scale_rate(stream, 2.5), HORIZON_S, s)) for s in range(shifts)]
+    counts = [len(release_times(scale_rate(stream, 2.5), HORIZON_S, s, room=400)) for s in range(shifts)]
     mean = 2.5 * (HORIZON_S - 10.0) / 600.0
     assert np.mean(counts) == pytest.approx(mean, abs=4 * np.sqrt(mean / shifts))
     assert scale_rate(Arrivals(kind="batch", count=2, every_s=30.0), 3.0) == Arrivals(
@@ -111,31 +108,23 @@ def test_a_scaled_stream_arrives_more_often() -> None:
     ("make", "says"),
     [
         (lambda: Arrivals(kind="poisson", every_s=0.0), r"Arrivals.every_s must be > 0 and finite \(got 0.0\)"),
+        (lambda: Arrivals(kind="poisson", every_s=math.nan), "every_s must be > 0 and finite"),
         (lambda: Arrivals(kind="poisson", every_s=1.0, start_s=5.0, stop_s=4.0), "0 <= start_s <= stop_s"),
         (lambda: Arrivals(kind="poisson", every_s=1.0, start_s=-1.0), "0 <= start_s <= stop_s"),
+        (lambda: Arrivals(kind="poisson", every_s=1.0, start_s=math.inf), "0 <= start_s <= stop_s"),
         (lambda: Arrivals(kind="batch", count=0), r"Arrivals.count must be >= 1 \(got 0\)"),
         (lambda: Arrivals(kind="batch", count=1, start_s=-1.0), "Arrivals.start_s must be >= 0"),
+        (lambda: Arrivals(kind="batch", count=1, start_s=math.inf), "Arrivals.start_s must be >= 0"),
         (lambda: Arrivals(kind="batch", count=1, every_s=0.0), "Arrivals.every_s must be > 0"),
+        (lambda: Arrivals(kind="batch", count=1, every_s=math.inf), "Arrivals.every_s must be > 0"),
         (lambda: Arrivals(kind="trace", times_s=(3.0, 2.0)), "in order"),
         (lambda: Arrivals(kind="trace", times_s=(-1.0,)), "in order"),
+        (lambda: Arrivals(kind="trace", times_s=(math.nan,)), "must be|in order"),
     ],
 )
 def test_streams_that_cannot_be_are_refused(make, says) -> None:
     with pytest.raises(ValueError, match=says):
         make()
-
-
-@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_numbers_that_are_none_are_refused(bad) -> None:
-    for make in (
-        lambda: Arrivals(kind="poisson", every_s=bad),
-        lambda: Arrivals(kind="poisson", every_s=1.0, start_s=bad),
-        lambda: Arrivals(kind="batch", count=1, start_s=bad),
-        lambda: Arrivals(kind="batch", count=1, every_s=bad),
-        lambda: Arrivals(kind="trace", times_s=(bad,)),
-    ):
-        with pytest.raises(ValueError, match=r"must be|needs"):
-            make()
 
 
 ALLOWED = {
@@ -195,17 +184,13 @@ def test_a_work_keeps_the_bounds(field, value):
     check(field, value, lambda: Work(kind="press", places=(HERE,), **{field: value}))
 
 
-@given(st.sampled_from(["release_s", "value"]), NUMBERS)
-def test_a_job_keeps_the_bounds(field, value):
+@given(
+    st.one_of(st.tuples(st.sampled_from(["release_s", "value"]), NUMBERS), INTEGERS.map(lambda n: ("repetitions", n)))
+)
+def test_a_job_keeps_the_bounds(changed):
+    field, value = changed
     fields = {"repetitions": 1, "release_s": 0.0, "value": 1.0} | {field: value}
     check(field, value, lambda: Job(name="j", work=HOLD, due_s=math.inf, **fields))
-
-
-@given(INTEGERS)
-def test_repetitions_keep_the_bounds(value):
-    check(
-        "repetitions", value, lambda: Job(name="j", work=HOLD, repetitions=value, release_s=0.0, due_s=1.0, value=1.0)
-    )
 
 
 @given(st.sampled_from(list(ALLOWED)), NUMBERS)
@@ -258,8 +243,6 @@ def test_a_place_named_twice_is_refused(kind):
         Work(kind=kind, places=(HERE, HERE))
     with pytest.raises(ValueError, match="two different places"):
         JobSpec("j", kind, ("here", "here"))
-    with pytest.raises(ScenarioError, match=r"jobs\[\d\]\.places must be two different places"):
-        with_stream("pick_place", kind=kind, places=["here", "here"])
 
 
 def test_a_coordinate_in_millimetres_is_questioned():
@@ -267,6 +250,3 @@ def test_a_coordinate_in_millimetres_is_questioned():
         Place(name="far", position_m=(450.0, 0.0, 300.0))
     with pytest.raises(ValueError, match="were millimetres meant"):
         Mount(position_m=(0.0, -620.0, 0.0))
-    arms = [{"name": "a", "position_m": [620.0, 0.0, 0.0]}]
-    with pytest.raises(ScenarioError, match=r"arms\[0\]\.position_m .* were millimetres meant\?"):
-        parse_scenario(msgspec.to_builtins(load("quickstart")) | {"arms": arms}, Path("quickstart.toml"))

@@ -8,7 +8,7 @@ from pathlib import Path
 import networkx as nx
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.integrate import solve_ivp
@@ -57,15 +57,6 @@ temperatures = st.floats(-20.0, 120.0)
 def test_published_torque_per_amp_is_11_and_7_6():
     # N·Kt of the large and small actuators, Kinova's values as quoted by HBRS-SDP/joint-friction-model.
     np.testing.assert_allclose(MOTORS.torque_per_amp, [11.0] * 4 + [7.6] * 3, rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("tau_nm", "amps"), [(23.5, 2.30), (33.2, 3.25), (41.2, 4.03), (50.1, 4.89), (58.9, 5.76), (8.7, 0.85)]
-)
-def test_holding_current_of_joint_2_as_published(tau_nm, amps):
-    # Scenario check of the identification report: holding torque and current of joint 2 at 25 °C.
-    held = current(np.full(JOINTS, tau_nm), REST, np.full(JOINTS, 25.0), MOTORS)
-    assert held[1] == pytest.approx(amps, abs=0.01)
 
 
 @given(torques, speeds, temperatures, temperatures)
@@ -151,54 +142,21 @@ def history(
     return np.array(list(steps))
 
 
-def crossing_min(temp_c: np.ndarray, limit_c: float, dt_s: float) -> float | None:
-    """Minutes until a rising history [time] passes a limit; None when it does not."""
-    above = np.flatnonzero(temp_c >= limit_c)
-    return None if above.size == 0 else float(above[0] * dt_s / 60.0)
-
-
-# Scenario check of the identification (MuJoCo gravity torques, 25 °C): torques of joints 2 and 4, minutes to 60 and
-# 75 °C from cold and from idle-warm, temperature after 30 min and after 3 h of holding from cold.
-HOLDS = {
-    "outstretched 0 kg": (23.5, 7.1, None, None, None, None, 38.5, 48.0),
-    "outstretched 1.1 kg": (33.2, 12.3, 100.0, None, 71.0, None, 47.9, 63.0),
-    "outstretched 2 kg": (41.2, 16.6, 33.0, 88.0, 16.0, 68.0, 58.8, 81.0),
-    "outstretched 3 kg": (50.1, 21.3, 12.6, 30.0, 5.0, 18.0, 75.1, 112.0),
-    "outstretched 4 kg": (58.9, 26.0, 5.5, 12.7, 2.7, 6.5, 97.5, 164.0),
-    "raised 4 kg": (51.0, 22.5, 11.4, 27.0, 4.5, 16.0, 77.0, 116.0),
-    "raised 3 kg": (43.3, 18.4, 26.0, 63.0, 11.0, 46.0, 62.0, 87.0),
-    "home 4 kg": (26.7, 18.1, None, None, None, None, 41.0, 52.0),
-}
-
-
-@pytest.mark.parametrize("name", HOLDS)
-def test_holds_heat_joint_2_as_published(name):
-    tau2, tau4, cold60, cold75, warm60, warm75, after_30_min, after_3_h = HOLDS[name]
-    dt_s = 2.0
-    cold = history(holding(tau2, tau4), np.full(NODES, 25.0), minutes=180, dt_s=dt_s)[:, J2]
-    warm = history(holding(tau2, tau4), idle_warm(25.0), minutes=180, dt_s=dt_s)[:, J2]
-    for temp_c, limit_c, published in (
-        (cold, 60.0, cold60),
-        (cold, 75.0, cold75),
-        (warm, 60.0, warm60),
-        (warm, 75.0, warm75),
-    ):
-        found = crossing_min(temp_c, limit_c, dt_s)
-        assert found is None if published is None else found == pytest.approx(published, rel=0.03, abs=0.05)
-    assert cold[round(30 * 60 / dt_s)] == pytest.approx(after_30_min, abs=0.4)
-    assert cold[-1] == pytest.approx(after_3_h, abs=0.7)
+@pytest.mark.parametrize(
+    ("tau2_nm", "tau4_nm", "after_30_min", "after_3_h"),
+    [(23.5, 7.1, 38.5, 48.0), (33.2, 12.3, 47.9, 63.0), (41.2, 16.6, 58.8, 81.0), (50.1, 21.3, 75.1, 112.0),
+     (58.9, 26.0, 97.5, 164.0), (51.0, 22.5, 77.0, 116.0), (43.3, 18.4, 62.0, 87.0), (26.7, 18.1, 41.0, 52.0)],
+)  # fmt: skip
+def test_holds_heat_joint_2_as_published(tau2_nm, tau4_nm, after_30_min, after_3_h):
+    """Scenario check of the identification from cold at 25 °C; its times to the limits are in `tests/test_hold.py`."""
+    temp_c = history(holding(tau2_nm, tau4_nm), np.full(NODES, 25.0), minutes=180, dt_s=5.0)[:, J2]
+    assert temp_c[360] == pytest.approx(after_30_min, abs=0.4)
+    assert temp_c[-1] == pytest.approx(after_3_h, abs=0.7)
 
 
 def test_idle_arm_settles_where_the_logged_one_does():
     published = [35.3, 32.6, 32.8, 34.3, 39.8, 41.5, 42.1]
     np.testing.assert_allclose(idle_warm(22.0)[WINDING], published, atol=0.3)
-
-
-def test_published_settling_temperature_of_the_rated_continuous_payload():
-    # 1.1 kg at full reach is what Kinova rates for continuous use; it passes the warning, never the fault.
-    end = steady_state(MODEL, holding(33.2, 12.3), REST, MOTORS, 25.0)
-    assert end is not None
-    assert end[J2] == pytest.approx(63.0, abs=1.5)
 
 
 @given(states, heats, st.floats(0.0, 5000.0))
@@ -245,7 +203,7 @@ def test_steady_state_balances_the_heat_of_every_node():
     np.testing.assert_allclose(found[HOUSING], [expected[housing(j)] for j in range(JOINTS)], rtol=1e-10)
 
 
-@pytest.mark.parametrize("tau2_nm", [0.0, 23.5, 41.2, 58.9])
+@pytest.mark.parametrize("tau2_nm", [0.0, 58.9])
 def test_settled_is_where_a_long_hold_ends(tau2_nm):
     end = steady_state(MODEL, holding(tau2_nm, 15.0), REST, MOTORS, 25.0)
     assert end is not None
@@ -266,6 +224,7 @@ def test_beyond_some_load_nothing_settles():
 
 
 @given(arrays(float, JOINTS, elements=st.floats(0.0, 110.0)), st.floats(-40.0, 60.0))
+@example(np.array([0, 0, 0, 0, 0, 0, 96.2]), 25.0)  # which settles nowhere
 def test_settled_is_a_balance_above_the_room_or_nothing(tau_nm, ambient_c):
     # Newton's method without care would also find balances far below absolute zero, or the unstable ones.
     current_sq = reference_current(tau_nm, REST, MOTORS) ** 2
@@ -276,11 +235,6 @@ def test_settled_is_a_balance_above_the_room_or_nothing(tau_nm, ambient_c):
         np.testing.assert_allclose(MODEL.steady(heat_w, ambient_c), end, atol=1e-6)
         hotter_w = drive_heat(end + 0.1, current_sq, REST, MOTORS)
         assert hotter_w.sum() - heat_w.sum() < 0.1 * MODEL.to_ambient.sum()  # Stable: a push away dies out.
-
-
-def test_a_hopeless_load_on_a_wrist_settles_nowhere():
-    current_sq = reference_current(np.array([0, 0, 0, 0, 0, 0, 96.2]), REST, MOTORS) ** 2
-    assert steady_state(MODEL, current_sq, REST, MOTORS, 25.0) is None
 
 
 def test_friction_and_idle_heat_enter_the_housings():
@@ -512,11 +466,8 @@ def test_real_arm_within_a_seventh_of_a_kelvin():
     assert len(logs) == 34
     rms_k = {log.name: np.sqrt(np.mean(residuals(log) ** 2, axis=0)) for log in logs}
     table = np.array(list(rms_k.values()))  # [file, joint]
-    worst = max(rms_k, key=lambda name: rms_k[name].max())
-    print(f"\nrms K, {len(logs)} files: median {np.median(table):.3f}, worst {table.max():.3f} ({worst})")
-    print("median per joint", np.median(table, axis=0).round(3), "worst per joint", table.max(axis=0).round(3))
     assert np.median(table) <= 0.15
-    assert table.max() <= 0.7
+    assert table.max() <= 0.7, max(rms_k, key=lambda name: rms_k[name].max())
 
 
 @needs_logs
