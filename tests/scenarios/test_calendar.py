@@ -141,7 +141,6 @@ BREAK = {"name": "lunch", "begin": "4:00", "end": "5:00"}
         ({"breaks": [{"name": "lunch", "begin": "4:00"}]}, r"breaks\[0\]: 'end' is missing; a break has begin and end"),
         ({"breaks": [BREAK | {"begin": "noon"}]}, r"breaks\[0\]: expected seconds, h:mm, h:mm:ss, or a date"),
         ({"breaks": [BREAK | {"arms": ["lefty"]}]}, r"breaks\[0\].arms: there is no arm 'lefty'; did you mean 'left'"),
-        ({"breaks": [BREAK | {"finish": "now"}]}, r"breaks\[0\].finish: 'now' is not allowed"),
         ({"breaks": [BREAK | {"begn": 3}]}, r"breaks\[0\]: unknown key 'begn'; did you mean 'begin_s'"),
         ({"breaks": [BREAK | {"weekdays": ["sunday"]}]}, r"weekdays need shift_begin, the begin of the shift"),
         (
@@ -157,11 +156,6 @@ BREAK = {"name": "lunch", "begin": "4:00", "end": "5:00"}
             {"breaks": [BREAK], "shift_begin": "2026-11-23T06:00Z", "horizon_s": 12 * HOUR_S},
             "4:00 to 5:00 is outside the shift, which begins at 06:00 and ends 12 h later",
         ),
-        ({"breaks": [BREAK], "horizon_s": 0}, "horizon_s must be"),
-        (
-            {"breaks": [BREAK], "shift_begin": "2026-11-23T06:00Z", "horizon_s": 2},
-            r"decision_interval_s must not exceed horizon_s \(got 10.0, 2.0\); is horizon_s in hours\?",
-        ),
         (
             {"breaks": [BREAK, BREAK | {"begin": "4:30", "arms": ["left"]}]},
             r"breaks\[1\].name: 'lunch' is also the name of breaks\[0\], which overlaps it on 'left': rename one",
@@ -175,14 +169,9 @@ BREAK = {"name": "lunch", "begin": "4:00", "end": "5:00"}
             {"breaks": [BREAK | {"begin": "24:00", "end": "0:00"}], "shift_begin": "2026-11-23T06:00Z"},
             r"breaks\[0\]: it ends at 0:00, before it begins at 24:00",
         ),
-        (
-            {"breaks": [BREAK | {"begin": "0:00", "end": "0:00"}], "shift_begin": "2026-11-23T06:00Z"},
-            r"breaks\[0\]: it ends at 0:00, before it begins at 0:00",
-        ),
         ({"breaks": [BREAK | {"begin_s": 14400}]}, r"breaks\[0\]: begin and begin_s are the same time; keep one"),
         ({"breaks": [BREAK | {"arms": []}]}, r"breaks\[0\].arms is empty: name the arms, or leave it out"),
         ({"breaks": [BREAK | {"begin": 480, "end": 510}]}, r"breaks\[0\] lasts 30 s: are its times minutes"),
-        ({"breaks": [{"name": "a", "begin_s": 480, "end_s": 510.0}]}, r"breaks\[0\] lasts 30 s: are its times minutes"),
         (
             {"shift_begin": "2026-03-29T02:30", "time_zone": "Europe/Berlin"},
             "shift_begin = 2026-03-29T02:30 does not exist: summer time leaves out this hour",
@@ -195,7 +184,6 @@ BREAK = {"name": "lunch", "begin": "4:00", "end": "5:00"}
             r"breaks\[0\].end_s must be after begin_s",
         ),
         ({"shift_begin": "9999-12-31T06:00Z"}, "shift_begin must be a date"),
-        ({"shift_begin": "2026-11-23T06:00"}, "shift_begin must be a date with time and zone"),
         (
             {"breaks": [BREAK | {"weekdays": ["sun"]}], "shift_begin": "2026-11-23T06:00Z"},
             r"breaks\[0\].weekdays: there is no day 'sun'",
