@@ -286,11 +286,14 @@ class AsArrays:
         )
 
 
-@pytest.fixture(scope="session")
-def plans(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="session", autouse=True)
+def plans(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The cache of plans and twins that all tests of a run share, in all workers; never the user's."""
     base = tmp_path_factory.getbasetemp()
-    return (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("THERMOFLEET_CACHE", str(folder))
+        yield folder
 
 
 @pytest.fixture(scope="session")

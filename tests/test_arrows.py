@@ -238,10 +238,6 @@ def test_no_folders_load_one_another():
     assert circles((folder_of(one), folder_of(other)) for one, other in ours(on_load=True)) == []
 
 
-def test_a_circle_is_found():
-    assert circles([("a", "b"), ("b", "c"), ("c", "a"), ("c", "d"), ("d", "d")]) == [{"a", "b", "c"}]
-
-
 def test_nobody_but_the_root_imports_an_adapter():
     adapters = [pair for pair in ours() if below(pair[1], "fleet.env.adapters")]
     assert [pair for pair in adapters if not below(pair[0], "fleet.env.adapters", "scenarios")] == []

@@ -1,4 +1,4 @@
-"""A separate cache for every example, and a router."""
+"""A router, and clients of it."""
 
 from contextlib import ExitStack
 
@@ -6,11 +6,6 @@ import pytest
 
 from fleet.bus.client import BusClient
 from fleet.bus.router import Router
-
-
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch) -> None:
-    monkeypatch.setenv("THERMOFLEET_CACHE", str(tmp_path / "cache"))
 
 
 @pytest.fixture

@@ -109,11 +109,8 @@ def endpoint() -> Iterator[str]:
 
 
 @pytest.fixture
-def thermofleet(
-    plans: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., CommandResult]:
+def thermofleet(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., CommandResult]:
     """The command line: `thermofleet("run", path, "--seed", 3)`."""
-    monkeypatch.setenv("THERMOFLEET_CACHE", str(plans))
     # A stage that is slow on a slow machine prints a line of progress; what a command prints shall not depend on that.
     monkeypatch.setattr("scenarios.terminal.AFTER_S", 1e6)
 

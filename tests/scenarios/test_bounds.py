@@ -66,7 +66,7 @@ def test_no_play_exceeds_the_upper_bound(small, seed, crowding, hot, period_s):
     assert upper_bound(Relaxation(world, DEAR, 1e9), heat=False).reward >= bound.reward - 1e-3
 
 
-TINY = ((0, 3), (0, 4), (2, 4), (6, 3), (7, 3))
+TINY = ((0, 3), (0, 4), (6, 3), (7, 3))
 """Seeds and numbers of jobs of shifts with at most 100 000 states."""
 
 
@@ -174,7 +174,7 @@ def fleet(three_arms, job_streams, plans: Path) -> Fleet:
 
 def test_a_reference_is_between_its_parts_and_its_schedule_can_be_replayed(fleet: Fleet):
     task = Instance("three/4", fleet.scenario, 4)
-    found = reference(fleet, task, Budget(evaluations=64), difficulty="blind")
+    found = reference(fleet, task, Budget(evaluations=64, nodes=20), difficulty="blind")
     shipped = {name: outcomes(fleet, name, [4])[0].reward for name in RULES if name != "random"}
     assert found.best_rule == pytest.approx(max(shipped.values()), abs=1e-9)
     assert shipped[found.rule] == pytest.approx(found.best_rule, abs=1e-9)
@@ -273,9 +273,3 @@ def test_stored_schedules_still_have_their_rewards():
         world = ShiftFactory(fleet)(np.random.SeedSequence(own.seed)).world
         simulator = ShiftSimulator(without_scores(world), weights_of(fleet.scenario), 1)
         assert simulator.follow([ScheduleReplay(each.claims)]).reward[0] == pytest.approx(each.hindsight, rel=1e-6)
-
-
-def test_the_stored_rows_are_in_order_of_what_they_bound():
-    rows = load_references(Path(__file__).parents[2] / "docs" / "results" / "bounds_library.jsonl")
-    assert len(rows) == 20
-    assert all(max(each.random, each.best_rule) <= each.hindsight <= each.upper for each in rows)

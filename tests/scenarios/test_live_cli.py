@@ -1,7 +1,6 @@
 """`thermofleet arm run`, `bus auctioneer`, `job submit` and `job list`."""
 
 import json
-import os
 import signal
 import socket
 import subprocess
@@ -73,8 +72,8 @@ def log(tmp_path):
 class Process:
     """`thermofleet arm …` until the end of the block."""
 
-    def __init__(self, *args, cache, cwd):
-        self.process = commands.start("arm", "run", *args, cwd=cwd, env={**os.environ, "THERMOFLEET_CACHE": str(cache)})
+    def __init__(self, *args, cwd):
+        self.process = commands.start("arm", "run", *args, cwd=cwd)
         self.killer = threading.Timer(PATIENCE_S, self.process.kill)
         self.killer.start()
         self.ready = self.process.stdout.readline()
@@ -161,10 +160,10 @@ def test_a_single_arm_has_the_twin_of_the_arm_of_the_fleet(small_toml, tmp_path)
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
-def test_an_arm_runs_as_a_process_and_exits_on_a_signal(small_toml, plans, tmp_path, number, code):
+def test_an_arm_runs_as_a_process_and_exits_on_a_signal(small_toml, tmp_path, number, code):
     with Router() as router, BusClient(router.endpoint, "heat") as link:
         options = ["--endpoint", router.endpoint, "--difficulty", "blind", "--rate-hz", 20]
-        with Process(small_toml, "left", *options, cache=plans, cwd=tmp_path) as arm:
+        with Process(small_toml, "left", *options, cwd=tmp_path) as arm:
             assert arm.ready.split() == ["ready", "left", router.endpoint, str(arm.process.pid)]
             states, info = receive(link, "heat", lambda states: len(states) > 5)
             assert "torch" not in Path(f"/proc/{arm.process.pid}/maps").read_text()
@@ -176,10 +175,10 @@ def test_an_arm_runs_as_a_process_and_exits_on_a_signal(small_toml, plans, tmp_p
         assert "the same command continues" in said.replace("\n", " ")
 
 
-def test_a_log_is_replayed_as_an_arm(small_toml, plans, log, tmp_path):
+def test_a_log_is_replayed_as_an_arm(small_toml, log, tmp_path):
     with Router() as router, BusClient(router.endpoint, "heat") as link:
         options = ["--source", "log", "--endpoint", router.endpoint, "--speed", 4, "--rate-hz", 20]
-        with Process(small_toml, "museum", log, *options, cache=plans, cwd=tmp_path) as arm:
+        with Process(small_toml, "museum", log, *options, cwd=tmp_path) as arm:
             assert arm.ready.startswith("ready museum")
             states, info = receive(link, "heat", lambda states: states and states[-1].mode == "idle")
             job = JobSpec(name="j", kind="hold", places=("bench",))

@@ -364,13 +364,6 @@ def test_an_instance_of_the_suite_has_a_seed_of_its_own():
     assert own_seed("heat_wave") == own_seed("some/cell.toml") == 0
 
 
-@pytest.fixture
-def cache(plans, monkeypatch):
-    """The folder of plans that all tests share."""
-    monkeypatch.setenv("THERMOFLEET_CACHE", str(plans))
-    return plans
-
-
 def cell(*arms, places, clearance_m=0.02, **more):
     jobs = [
         {"name": f"hold_{name}", "kind": "hold", "places": [name], "payload_kg": [1.0], "dwell_s": 2.0, **more}
@@ -394,7 +387,7 @@ PLACES = {"middle": (0.0, 0.0, 0.25), "left": (-0.9, 0.3, 0.25), "moon": (9.0, 0
 
 
 @pytest.mark.parametrize("name", CELLS)
-def test_three_arms_of_every_library_cell_can_work_at_once(name, cache):
+def test_three_arms_of_every_library_cell_can_work_at_once(name):
     report = layout_report(load(name))
     assert report.problems == ()
     assert len(report.at_once) >= 3
@@ -402,9 +395,9 @@ def test_three_arms_of_every_library_cell_can_work_at_once(name, cache):
 
 
 @pytest.mark.parametrize("name", [cell for cell in CELLS if cell.values != ("scale_64",)])
-def test_the_largest_set_is_the_one_that_trying_all_finds(name, cache):
+def test_the_largest_set_is_the_one_that_trying_all_finds(name):
     scenario = load(name)
-    fleet = prepare(scenario, difficulty="blind", cache=cache)
+    fleet = prepare(scenario, difficulty="blind")
     choices = []
     for each in fleet.arms:
         plans = [variants[0] for variants in each.plans.values()] + [v[-1] for v in each.plans.values()]
@@ -420,24 +413,24 @@ def test_the_largest_set_is_the_one_that_trying_all_finds(name, cache):
     assert len(layout_report(scenario).at_once) == most
 
 
-def test_a_work_that_comes_too_close_to_a_home_is_infeasible_and_says_so(cache):
+def test_a_work_that_comes_too_close_to_a_home_is_infeasible_and_says_so():
     beside = arm("beside", 0.05, -0.5, 90.0)
     places = {"middle": PLACES["middle"], "left": PLACES["left"]}
-    fleet = prepare(cell(APART[0], beside, places=places), difficulty="blind", cache=cache)
+    fleet = prepare(cell(APART[0], beside, places=places), difficulty="blind")
     (error,) = (each for each in fleet.infeasible if each.arm == "west")
     assert error.place == "middle"
     assert "beside (" in error.reason
     assert error.reason.endswith(") at home")
-    alone = prepare(cell(APART[0], places=places), difficulty="blind", cache=cache)
+    alone = prepare(cell(APART[0], places=places), difficulty="blind")
     assert alone.infeasible == ()
 
 
 @pytest.mark.ci_slow
-def test_clearance_changes_the_space(cache):
+def test_clearance_changes_the_space():
     scenario = load("quickstart")
     shares = []
     for clearance_m in (0.0, 0.02, 0.06):
-        fleet = prepare(replace(scenario, clearance_m=clearance_m), difficulty="blind", cache=cache)
+        fleet = prepare(replace(scenario, clearance_m=clearance_m), difficulty="blind")
         plans = [variants[0] for each in fleet.arms for variants in each.plans.values()]
         volumes, conflicts = fleet.space.rows(plans)
         shares.append(conflicts[np.ix_(volumes, volumes)].mean())
@@ -448,9 +441,9 @@ def test_clearance_changes_the_space(cache):
             replace(scenario, clearance_m=wrong)
 
 
-def test_problems_are_reported_all_at_once(cache):
+def test_problems_are_reported_all_at_once():
     with pytest.raises(ScenarioError) as error:
-        prepare(cell(*TOGETHER, places=PLACES), difficulty="blind", cache=cache)
+        prepare(cell(*TOGETHER, places=PLACES), difficulty="blind")
     lines = str(error.value).splitlines()
     assert [line for line in lines if "at home 'west' (" in line and "'east' (" in line]
     assert [line for line in lines if "at home 'west' (" in line and "'north' (" in line]
@@ -458,10 +451,10 @@ def test_problems_are_reported_all_at_once(cache):
     report = layout_report(cell(*TOGETHER, places=PLACES))
     assert list(report.problems) == lines
     with pytest.raises(FleetError, match="at home 'west'"):
-        prepare_arm(cell(*TOGETHER, places=PLACES), "west", difficulty="blind", cache=cache)
+        prepare_arm(cell(*TOGETHER, places=PLACES), "west", difficulty="blind")
 
 
-def test_a_cell_that_does_not_work_is_drawn_with_the_distance_that_lacks(cache, tmp_path):
+def test_a_cell_that_does_not_work_is_drawn_with_the_distance_that_lacks(tmp_path):
     scenario = cell(*TOGETHER, places=PLACES)
     report = layout_report(scenario)
     lacks_m = {(each.arm, each.place): each.lacks_m for each in report.reach}
@@ -472,7 +465,7 @@ def test_a_cell_that_does_not_work_is_drawn_with_the_distance_that_lacks(cache, 
 
 
 @pytest.mark.ci_slow
-def test_the_command_shows_the_cell_and_fails_if_there_are_problems(cache, tmp_path, capsys):
+def test_the_command_shows_the_cell_and_fails_if_there_are_problems(tmp_path, capsys):
     def call(*arguments):
         with pytest.raises(SystemExit) as stop:
             main(["layout", *map(str, arguments)])
@@ -500,7 +493,7 @@ def test_the_command_shows_the_cell_and_fails_if_there_are_problems(cache, tmp_p
     assert "Error: near.toml: arms: at home 'arm_0' (" in err
 
 
-def test_the_layout_of_a_file_with_wrong_jobs_shows_its_cell(cache, small_toml, tmp_path, capsys):
+def test_the_layout_of_a_file_with_wrong_jobs_shows_its_cell(small_toml, tmp_path, capsys):
     file, picture = tmp_path / "typo.toml", tmp_path / "cell.png"
     text = small_toml.read_text(encoding="utf-8")
     file.write_text(re.sub(r"^places = \[.*\]$", 'places = ["nowhere"]', text, count=1, flags=re.MULTILINE))
@@ -517,7 +510,7 @@ def test_the_layout_of_a_file_with_wrong_jobs_shows_its_cell(cache, small_toml, 
     assert "position_m: expected a list" in capsys.readouterr().err
 
 
-def test_stations_side_by_side_are_for_one_arm_at_a_time(cache):
+def test_stations_side_by_side_are_for_one_arm_at_a_time():
     close = {"middle": (0.0, 0.0, 0.25), "beside": (0.0, 0.12, 0.25)}
     report = layout_report(cell(*APART, places=close))
     assert len(report.at_once) == 1
@@ -527,14 +520,14 @@ def test_stations_side_by_side_are_for_one_arm_at_a_time(cache):
     assert (len(apart.at_once), apart.excluded_share, apart.exclusions) == (2, 0.0, ())
 
 
-def test_an_arm_that_never_settles_at_home_is_a_problem_of_the_cell(cache):
+def test_an_arm_that_never_settles_at_home_is_a_problem_of_the_cell():
     unventilated = cell(APART[0] | {"cooling_factor": 0.01}, APART[1], places=BESIDE)
     (problem,) = layout_report(unventilated).problems
     assert problem.startswith("cell.toml: arms[0]: Arm 'west' has no steady state when idle at home")
     assert layout_report(replace(unventilated, start="cold")).problems == ()
 
 
-def test_an_arm_that_can_do_no_job_is_a_problem_with_its_reasons(cache):
+def test_an_arm_that_can_do_no_job_is_a_problem_with_its_reasons():
     alone = cell(*APART, places={"left": BESIDE["left"]})
     problem = (
         "cell.toml: arms[1]: 'east' can do no job (left: reach: 1.55 m from the base of the arm); move the arm or the "
@@ -542,11 +535,11 @@ def test_an_arm_that_can_do_no_job_is_a_problem_with_its_reasons(cache):
     )
     assert layout_report(alone).problems == (problem,)
     with pytest.raises(ScenarioError) as error:
-        prepare(alone, difficulty="blind", cache=cache)
+        prepare(alone, difficulty="blind")
     assert str(error.value) == problem
 
 
-def test_a_shift_that_begins_below_the_lower_limit_is_a_problem_of_the_cell(cache):
+def test_a_shift_that_begins_below_the_lower_limit_is_a_problem_of_the_cell():
     cold = replace(cell(*APART, places=BESIDE), ambient=Ambient(points=((0.0, -5.0),)))
     first, second = layout_report(replace(cold, start="cold")).problems
     assert first.startswith("cell.toml: arms[0]: a motor of 'west' begins at -")

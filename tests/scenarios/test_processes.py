@@ -85,7 +85,7 @@ def test_a_process_that_ends_as_it_gets_work_is_replaced(monkeypatch):
     worker = LocalWorker()
     ran = [worker.submit(Call(n, function, ())).result(PATIENCE_S) for n, function in enumerate((os.getpid, grow))]
     ran += [worker.submit(Call(n, os.getpid, ())).result(PATIENCE_S) for n in range(2)]
-    for pause_s in (0.29, 0.3, 0.31):
+    for pause_s in (0.29, 0.3):
         PAUSE.wait(pause_s)
         ran.append(worker.submit(Call(9, os.getpid, ())).result(PATIENCE_S))
     assert len(set(ran)) >= 2
@@ -159,9 +159,7 @@ def test_a_second_ctrl_c_leaves_nothing(thermofleet, small_toml, tmp_path, press
     assert [p.name for p in tmp_path.iterdir()] == ["heat.toml"]
 
 
-def test_ctrl_c_while_planning_writes_nothing_and_keeps_the_plans(
-    thermofleet, small_toml, tmp_path, monkeypatch, plans
-):
+def test_ctrl_c_while_planning_writes_nothing_and_keeps_the_plans(thermofleet, small_toml, tmp_path, monkeypatch):
     from fleet.arm.planner import Planner
 
     made = 0
@@ -186,7 +184,7 @@ def test_ctrl_c_while_planning_writes_nothing_and_keeps_the_plans(
     assert sum("profile" in arrays for arrays in kept) == 2
 
 
-def test_a_killed_run_leaves_only_a_folder_with_a_dot(small_toml, tmp_path, plans):
+def test_a_killed_run_leaves_only_a_folder_with_a_dot(small_toml, tmp_path):
     program = textwrap.dedent("""
         import os, signal, sys
         import scenarios.policy_loader
@@ -201,8 +199,7 @@ def test_a_killed_run_leaves_only_a_folder_with_a_dot(small_toml, tmp_path, plan
     """)
     where = tmp_path / "runs"
     command = [sys.executable, "-c", program, "run", str(small_toml), *QUICK, "--out", str(where / "run")]
-    env = {**os.environ, "THERMOFLEET_CACHE": str(plans)}
-    killed = subprocess.run(command, env=env, capture_output=True, timeout=240, check=False)
+    killed = subprocess.run(command, capture_output=True, timeout=240, check=False)
     assert killed.returncode == -signal.SIGKILL
     assert all(p.name.startswith(".run.") for p in where.iterdir())
 

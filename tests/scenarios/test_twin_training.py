@@ -33,8 +33,7 @@ TINY = TwinConfig(max_windows=64, epochs=2, restarts=1, hidden=4, allow_collapse
 
 
 @pytest.fixture
-def scenario(small_toml, plans, monkeypatch) -> Scenario:
-    monkeypatch.setenv("THERMOFLEET_CACHE", str(plans))
+def scenario(small_toml) -> Scenario:
     return override(load(small_toml), twin={"size": "quick", "exploration": 9}, spread={"seed": 4})
 
 
