@@ -23,7 +23,7 @@ TINY = {
     "--novel 8",
     "sides": "--count 2 --train 20 --exploration 6 --reference 20 --test 60 --novel 2",
     "sweep": "--scenarios heat_wave --arms 0 --only ours --train 10 --test 60",
-    "parsimony": "--scenarios heat_wave --train 6 --test 60",
+    "parsimony": "--scenarios heat_wave --arms 0 --train 6 --test 60",
     "surprises": "--sources oracle --cells 1",
     "questions": "--seeds 1 --epochs 4",
     "forecast": "",
@@ -75,6 +75,7 @@ def test_documented_options_exist_and_stored_rows_are_those_of_the_line(name, op
 )
 def test_a_tiny_run_writes_its_rows_and_prints_its_tables(name, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("benchmarks.paper.sweep.JOBS", (3,))
+    monkeypatch.setattr("benchmarks.paper.sweep.STEPS", 10)
     words = [name, *TINY[name].split(), "--out", str(tmp_path / "rows.jsonl")]
     if "--log" in " ".join(options for each, options in documented() if each == name):
         if not LOGS.is_dir():

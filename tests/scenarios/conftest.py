@@ -1,12 +1,13 @@
 """A small cell whose plans are made once for all tests here, and the command line called in place."""
 
+import json
 import os
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from unittest.mock import patch
 
 import numpy as np
@@ -19,8 +20,10 @@ from fleet.heat.motor import gen3_motors
 from fleet.heat.thermal import ThermalSpread, gen3_network, spread_motors, thermal_model
 from fleet.robot import Robot
 from scenarios.cli.main import main
-from scenarios.motion.generate import bare_arm
+from scenarios.motion.generate import Verification, bare_arm
 from scenarios.prepare.twins import cold_peaks, records
+from scenarios.spec.load import load
+from scenarios.spec.schema import Scenario
 from twin.vae.config import TwinConfig
 from twin.vae.train import train
 
@@ -70,6 +73,23 @@ speeds = [1.0]
 """
 
 
+QUICK = ("--difficulty", "blind", "--bus", "memory", "--policy", "round_robin")
+"""Options of a run that takes little time."""
+
+
+def run_json(folder: Path) -> dict[str, Any]:
+    """The card of a run."""
+    return json.loads((folder / "run.json").read_text(encoding="utf-8"))
+
+
+class Known:
+    """A reference as `scenarios.evaluate.references` stores it, with what scores read."""
+
+    def __init__(self, instance: str, random: float, hindsight: float, upper: float) -> None:
+        self.instance, self.random, self.hindsight, self.upper = instance, random, hindsight, upper
+        self.unit = max(hindsight - random, 0.1 * hindsight)
+
+
 class CommandResult(NamedTuple):
     """Exit code and output of one call of the command line."""
 
@@ -99,6 +119,18 @@ def small_toml(tmp_path: Path) -> Path:
     path = tmp_path / "heat.toml"
     path.write_text(SMALL, encoding="utf-8")
     return path
+
+
+@pytest.fixture
+def scenario(small_toml: Path) -> Scenario:
+    """The small scenario."""
+    return load(small_toml)
+
+
+@pytest.fixture(scope="module")
+def asked(subject: SimpleNamespace) -> Verification:
+    """What a motion of the subject is verified with."""
+    return Verification.nominal(subject.arm.robot, 23.0)
 
 
 @pytest.fixture

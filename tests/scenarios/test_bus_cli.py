@@ -120,9 +120,7 @@ def test_a_port_in_use_is_one_sentence(thermofleet):
 KEYS = {
     "{keys} quickstart": "holds the keys of a fleet",
     "{keys} --add gateway:submitter": "has a certificate",
-    "{keys} --add x:router --host ''": "is not a host name or address",
     "{keys} --add x:router --host 'a b'": "is not a host name or address",
-    "{keys} --add x:king": "no role 'king'. Allowed: arm",
     "{keys} --add x:submiter": "did you mean 'submitter'?",
     "{keys} --add x": "is not NAME:ROLE",
     "{keys} --add ca:monitor": "cannot be named 'ca'",
@@ -135,7 +133,6 @@ KEYS = {
 ROUTER = {
     "--host 0.0.0.0": "Plain TCP does not authenticate",
     "--host 192.0.2.1": "is not on loopback",
-    "--port 70000": "--port must be 0 to 65535",
     "--scenario quickstart": "--scenario needs --tls",
     "--tls {keys} --scenario heat_wave": "are for the fleet 'quickstart', not for 'heat_wave'",
     "--tls {keys}/none": "There is no '",
@@ -151,9 +148,7 @@ SEVERAL_MACHINES = {
 ROS2 = {
     "listen /joint_states": "has no motor temperatures",
     "listen /j --temperatures /d --joints a,a": "different names",
-    "listen /j --temperatures /d --rate-hz 0": "--rate-hz must be",
     "jobs": "needs the Python module 'rclpy' of ROS 2",
-    "bridge --domain 233": "--domain must be 0 to 232",
     "bridge --fleet f --warning-c 80": "--warning-c must be less than --error-c",
     "bridge --endpoint tls/127.0.0.1:7447#keys/arm_0": "name the router of ROS 2 with --router",
 }
@@ -365,7 +360,6 @@ def test_with_a_token_any_address_is_allowed_with_a_warning(caplog):
     [
         ("operator sixteen-or-more-characters", 0o644, "chmod 600"),
         ("operater sixteen-or-more-characters", 0o600, "line 1: no role 'operater'; did you mean 'operator'?"),
-        ("operator short", 0o600, "16 or more"),
         ("# nothing", 0o600, "has no tokens"),
     ],
 )

@@ -31,13 +31,8 @@ from scenarios.spec.load import library, load
 from scenarios.spec.options import ENDPOINT, PORT, Budget, LiveSpec, RunSpec, Shot, StudySpec
 from scenarios.suite.instances import CELLS
 from tests.commands import REAL
+from tests.scenarios.conftest import QUICK, run_json
 from twin.thermal.identify import AMBIENT_C
-
-QUICK = ("--difficulty", "blind", "--bus", "memory", "--policy", "round_robin")
-
-
-def run_json(folder: Path) -> dict:
-    return json.loads((folder / "run.json").read_text(encoding="utf-8"))
 
 
 def test_a_run_prints_its_figures_and_leaves_four_files(thermofleet, small_toml, tmp_path):

@@ -8,7 +8,6 @@ import json
 import math
 import re
 import shlex
-from collections.abc import Iterable
 from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -38,13 +37,9 @@ from scenarios.spec.load import load
 from scenarios.spec.schema import Scenario
 from scenarios.suite.splits import manifest
 from scenarios.table import Table
+from tests.scenarios.conftest import Known
 
 POLICIES = ("random", "round_robin")
-
-
-@pytest.fixture
-def scenario(small_toml: Path) -> Scenario:
-    return load(small_toml)
 
 
 def compared(scenario: Scenario, plans: Path, workers: int, **changes) -> Comparison:
@@ -170,16 +165,7 @@ def test_picked_instances_are_no_range(names, text):
 REWARD = {"wspt": 10.0, "wsept": 14.0, "fifo": 6.0}
 
 
-class Known:
-    """What scores read of a reference: random 0, hindsight 20, bound 40."""
-
-    random, hindsight, upper, unit = 0.0, 20.0, 40.0, 20.0
-
-    def __init__(self, instance: str) -> None:
-        self.instance = instance
-
-
-KNOWN_SHIFTS = {("quickstart", seed): Known(f"quickstart/{seed}") for seed in range(6)}
+KNOWN_SHIFTS = {("quickstart", seed): Known(f"quickstart/{seed}", 0.0, 20.0, 40.0) for seed in range(6)}
 
 
 @pytest.fixture
@@ -314,6 +300,7 @@ def test_the_verdict_names_the_baseline_and_the_policy_that_is_second(study: Stu
     worse = {"wspt": "fifo, random", "fifo": "random", "wsept": "wspt, fifo, random"}[baseline]
     assert f"Significantly below the baseline {baseline}: {worse}." in " ".join([first, *more])
     first = first.partition(" Significantly")[0]
+    assert first.startswith("quickstart, 6 seeds, this fleet only: wsept has the most reward, 14.") == (not known)
     for other in others:
         more = means["wsept"] - means[other.split()[-1]]
         number = rf"{more / 20:.2f}" if known else rf"{more:.1f}"
@@ -321,16 +308,6 @@ def test_the_verdict_names_the_baseline_and_the_policy_that_is_second(study: Stu
         assert re.search(by, first), (by, first)
     assert ("baseline" in first) == (baseline != "wsept")
     assert len(re.findall("wspt|fifo|random", first.partition("wsept")[2])) == len(others)
-
-
-def test_without_references_the_verdict_is_of_rewards(study: Study):
-    first, choice = verdict(judged(study, rows_of(study), {}))
-    assert choice.startswith("Intervals are not adjusted for the choice of the best policy")
-    assert re.fullmatch(
-        r"quickstart, 6 seeds, this fleet only: wsept has the most reward, 14\.\d; "
-        r"[34]\.\d \[[234]\.\d, [45]\.\d\] more than the baseline and next policy wspt\. .*",
-        first,
-    )
 
 
 def test_charts_place_points_by_value():
@@ -470,34 +447,26 @@ least_difficulty@rc
 """)
 
 
-def rewards(thermofleet, file: Path, out: Path, names: Iterable[str]) -> dict[str, list[float]]:
-    """The rewards of each POLICY@SOURCE, in the order of `QUICK`."""
-    how = ("--fleets", 2, "--trainings", 2, "--seeds", 2, "--first-seed", 10_000, "--out", out)
-    done = thermofleet("compare", file, "--policies", ",".join(names), *how)
+@pytest.mark.parametrize(
+    ("twin", "expected"),
+    [
+        pytest.param("", QUICK, marks=pytest.mark.ci_slow, id="quick"),
+        pytest.param('\n[twin]\nsize = "quick"\n', TRAINED, marks=pytest.mark.slow, id="trained"),
+    ],
+)
+def test_sources_have_the_rewards_that_they_always_had(thermofleet, small_toml, tmp_path, twin, expected) -> None:
+    """Equal up to the rounding of energies in float32."""
+    small_toml.write_text(small_toml.read_text() + twin)
+    how = ("--fleets", 2, "--trainings", 2, "--seeds", 2, "--first-seed", 10_000, "--out", tmp_path / "out")
+    done = thermofleet("compare", small_toml, "--policies", ",".join(expected), *how)
     assert done.code == 0, done.err
     found: dict[str, list[float]] = {}
-    for row in read_rows(out):
+    for row in read_rows(tmp_path / "out"):
         assert row.outcome is not None
         found.setdefault(f"{row.key.policy}@{row.key.difficulty}", []).append(row.outcome.reward)
-    return found
-
-
-def assert_alike(found: dict[str, list[float]], expected: dict[str, list[float]]) -> None:
-    """Assert that rewards are equal up to the rounding of energies in float32."""
     assert found.keys() == expected.keys()
     for name, values in expected.items():
         assert found[name] == pytest.approx(values, rel=1e-10), name
-
-
-@pytest.mark.ci_slow
-def test_sources_have_the_rewards_that_they_always_had(thermofleet, small_toml, tmp_path) -> None:
-    assert_alike(rewards(thermofleet, small_toml, tmp_path / "out", QUICK), QUICK)
-
-
-@pytest.mark.slow
-def test_trained_sources_have_the_rewards_that_they_always_had(thermofleet, small_toml, tmp_path) -> None:
-    small_toml.write_text(f'{small_toml.read_text()}\n[twin]\nsize = "quick"\n')
-    assert_alike(rewards(thermofleet, small_toml, tmp_path / "out", TRAINED), TRAINED)
 
 
 @pytest.mark.ci_slow

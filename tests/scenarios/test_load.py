@@ -548,11 +548,6 @@ def test_a_shift_that_begins_below_the_lower_limit_is_a_problem_of_the_cell():
     assert layout_report(cold).problems == ()  # powered for hours, its idle heat keeps every motor above 0 °C
 
 
-@pytest.fixture
-def small_scenario(small_toml) -> Scenario:
-    return load(small_toml)
-
-
 def drawn(scenario: Scenario, seed: int):
     return draw_jobs(scenario, np.random.SeedSequence(seed))
 
@@ -563,31 +558,31 @@ def with_stream(scenario: Scenario, index: int, **changes) -> Scenario:
     return replace(scenario, jobs=tuple(streams))
 
 
-def test_the_same_seed_draws_the_same_jobs_and_another_seed_others(small_scenario):
-    assert drawn(small_scenario, 3) == drawn(small_scenario, 3)
-    assert drawn(small_scenario, 3) != drawn(small_scenario, 4)
+def test_the_same_seed_draws_the_same_jobs_and_another_seed_others(scenario):
+    assert drawn(scenario, 3) == drawn(scenario, 3)
+    assert drawn(scenario, 3) != drawn(scenario, 4)
 
 
-def test_jobs_come_in_order_of_release_and_every_one_is_one_its_stream_asks_for(small_scenario):
-    streams = {stream.name: stream for stream in small_scenario.jobs}
+def test_jobs_come_in_order_of_release_and_every_one_is_one_its_stream_asks_for(scenario):
+    streams = {stream.name: stream for stream in scenario.jobs}
     for seed in range(20):
-        jobs = drawn(small_scenario, seed)
+        jobs = drawn(scenario, seed)
         times = [job.release_s for job in jobs]
         assert times == sorted(times)
-        assert 0 <= times[0] <= times[-1] < small_scenario.horizon_s
+        assert 0 <= times[0] <= times[-1] < scenario.horizon_s
         assert len({job.name for job in jobs}) == len(jobs)
         for job in jobs:
             stream = streams[job.name.rsplit("-", 1)[0]]
             low, high = stream.repetitions
             assert low <= job.repetitions <= high
-            assert job.work in works_of(small_scenario, stream)
+            assert job.work in works_of(scenario, stream)
             assert job.due_s == job.release_s + stream.due_s
             assert job.value == stream.value
 
 
-def test_payloads_and_repetitions_are_drawn_evenly(small_scenario):
+def test_payloads_and_repetitions_are_drawn_evenly(scenario):
     """Against the binomial and uniform laws at four standard deviations."""
-    many = with_stream(small_scenario, 1, arrivals=Arrivals(kind="batch", count=3000))
+    many = with_stream(scenario, 1, arrivals=Arrivals(kind="batch", count=3000))
     jobs = [job for job in drawn(many, 0) if job.name.startswith("sort")]
     light = sum(job.work.payload_kg == 0.2 for job in jobs)
     assert abs(light - 1500) < 4 * np.sqrt(3000 / 4)
@@ -596,65 +591,65 @@ def test_payloads_and_repetitions_are_drawn_evenly(small_scenario):
         assert abs(count - 1000) < 4 * np.sqrt(3000 * (1 / 3) * (2 / 3))
 
 
-def test_a_further_stream_disturbs_none_of_the_others(small_scenario):
-    further = replace(small_scenario, jobs=(*small_scenario.jobs, replace(small_scenario.jobs[1], name="more")))
-    before, after = drawn(small_scenario, 5), drawn(further, 5)
+def test_a_further_stream_disturbs_none_of_the_others(scenario):
+    further = replace(scenario, jobs=(*scenario.jobs, replace(scenario.jobs[1], name="more")))
+    before, after = drawn(scenario, 5), drawn(further, 5)
     assert set(before) == {job for job in after if not job.name.startswith("more")}
 
 
-def test_a_stream_after_another_waits_for_the_job_of_the_same_number(small_scenario):
-    chained = with_stream(small_scenario, 1, after=("hold",), arrivals=Arrivals(kind="batch", count=3))
+def test_a_stream_after_another_waits_for_the_job_of_the_same_number(scenario):
+    chained = with_stream(scenario, 1, after=("hold",), arrivals=Arrivals(kind="batch", count=3))
     after = {job.name: job.after for job in drawn(chained, 0)}
     assert after["sort-001"] == ("hold-001",)
     assert after["sort-002"] == ("hold-002",)
     assert after["sort-003"] == ()  # there are only two holds
 
 
-def test_works_are_one_per_payload_without_repeats(small_scenario):
-    assert [(work.kind, work.payload_kg) for work in all_works(small_scenario)] == [
+def test_works_are_one_per_payload_without_repeats(scenario):
+    assert [(work.kind, work.payload_kg) for work in all_works(scenario)] == [
         ("hold", 2.0),
         ("sort", 0.2),
         ("sort", 0.5),
     ]
-    doubled = with_stream(small_scenario, 0, payload_kg=(2.0, 2.0))
-    assert all_works(doubled) == all_works(small_scenario)
+    doubled = with_stream(scenario, 0, payload_kg=(2.0, 2.0))
+    assert all_works(doubled) == all_works(scenario)
 
 
-def test_an_arm_rehearses_every_motion_with_its_own_and_with_light_payloads(small_scenario):
-    rehearsed = {(work.kind, work.payload_kg) for work in rehearsal_works(small_scenario)}
-    light = {(kind, kg) for kind in ("hold", "sort") for kg in small_scenario.twin.payload_kg}
-    assert rehearsed == light | {(work.kind, work.payload_kg) for work in all_works(small_scenario)}
+def test_an_arm_rehearses_every_motion_with_its_own_and_with_light_payloads(scenario):
+    rehearsed = {(work.kind, work.payload_kg) for work in rehearsal_works(scenario)}
+    light = {(kind, kg) for kind in ("hold", "sort") for kg in scenario.twin.payload_kg}
+    assert rehearsed == light | {(work.kind, work.payload_kg) for work in all_works(scenario)}
 
 
-def test_a_fixture_of_the_file_is_in_the_cell(small_scenario):
+def test_a_fixture_of_the_file_is_in_the_cell(scenario):
     written = {"name": "oven", "position_m": (0.0, 1.0, 0.5), "size_m": (0.4, 0.4, 1.0)}
-    scenario = override(small_scenario, fixtures=(written,))
+    scenario = override(scenario, fixtures=(written,))
     assert scenario.fixtures == (Fixture(name="oven", position_m=(0.0, 1.0, 0.5), size_m=(0.4, 0.4, 1.0)),)
     assert cell_of(scenario).fixtures == scenario.fixtures
 
 
-def test_all_arms_whose_home_is_inside_a_fixture_are_named(small_scenario, tmp_path):
+def test_all_arms_whose_home_is_inside_a_fixture_are_named(scenario, tmp_path):
     beam = Fixture(name="beam", position_m=(0.0, 0.0, 0.4), size_m=(2.0, 0.1, 0.3))
     with pytest.raises(ScenarioError) as error:
-        prepare(replace(small_scenario, fixtures=(beam,)), difficulty="blind", cache=tmp_path)
+        prepare(replace(scenario, fixtures=(beam,)), difficulty="blind", cache=tmp_path)
     said = str(error.value).splitlines()
     for arm, line in zip(("arms[0] 'left'", "arms[1] 'right'"), said, strict=False):
         assert f"{arm} at home: " in line
         assert "mm inside the fixture 'beam'; move the arm or the fixture" in line
 
 
-def test_work_that_no_arm_can_do_for_a_fixture_is_refused_with_the_reason(small_scenario, tmp_path):
+def test_work_that_no_arm_can_do_for_a_fixture_is_refused_with_the_reason(scenario, tmp_path):
     crate = Fixture(name="crate", position_m=(0.0, 0.2, 0.2), size_m=(0.1, 0.1, 0.1))
     with pytest.raises(ScenarioError, match=r"left at 'bench': collision: .* inside the fixture 'crate' on the way"):
-        prepare(replace(small_scenario, fixtures=(crate,)), difficulty="blind", cache=tmp_path)
+        prepare(replace(scenario, fixtures=(crate,)), difficulty="blind", cache=tmp_path)
 
 
 @pytest.mark.parametrize("plant", ["profile", "mujoco"])
-def test_contacts_are_counted_by_the_plant_that_finds_them(small_scenario, plans, plant, monkeypatch):
+def test_contacts_are_counted_by_the_plant_that_finds_them(scenario, plans, plant, monkeypatch):
     """One contact in every step, made up."""
     touch = Event(time_s=1.0, kind="contact", arm="left", value=3.0)
     monkeypatch.setattr(ContactFinder, "events", lambda *_: [touch])
-    fleet = prepare(override(small_scenario, horizon_s=60.0), difficulty="blind", cache=plans)
+    fleet = prepare(override(scenario, horizon_s=60.0), difficulty="blind", cache=plans)
     result = run(fleet, RunSpec(policy="round_robin", plant=plant, bus="memory", difficulty="blind"), record=False)
     steps = 6 if plant == "mujoco" else 0
     assert result.metrics.contacts == (steps or None)

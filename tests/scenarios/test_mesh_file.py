@@ -179,7 +179,6 @@ WRONG = [
     (UNIT | {"size_m": [1, 1, 1]}, r"fixtures\[0\].size_m must be left out beside `mesh`"),
     ({"mesh": "none.stl"}, r"fixtures\[0\].mesh: 'none.stl': there is no such file\. Paths are relative to"),
     ({"mesh": "big.step"}, r"'big.step' must end in .stl, .obj, .glb, .xml, .mjcf, .urdf"),
-    ({"mesh": ""}, r"'' must end in .stl"),
     ({"mesh": "text.stl"}, r"'text.stl' has 0 triangles; allowed are 1 to 100000. Export the shape as a surface"),
     ({"mesh": "text.glb"}, r"'text.glb' cannot be read as GLB: "),
     ({"mesh": "text.urdf"}, r"'text.urdf' cannot be read as URDF: XML parse error"),

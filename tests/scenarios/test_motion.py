@@ -17,15 +17,10 @@ from fleet.heat.thermal import NODES, WINDING, gen3_network, thermal_model
 from fleet.job import Place, Work
 from fleet.motion import RATE_HZ, Phase
 from fleet.robot import GEN3, Robot
-from scenarios.motion.generate import GenerationError, Verification, bare_arm, generate, perform
+from scenarios.motion.generate import GenerationError, bare_arm, generate, perform
 from scenarios.motion.recover import Candidate, Nearby, Recovery, Search, save_generated, save_recovery
 from scenarios.prepare.twins import cold_peaks
 from twin.vae.generate import vary
-
-
-@pytest.fixture(scope="module")
-def asked(subject):
-    return Verification.nominal(subject.arm.robot, 23.0)
 
 
 @pytest.fixture(scope="module")

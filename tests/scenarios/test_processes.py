@@ -24,6 +24,7 @@ from scenarios.run.log import FILES, RUN
 from scenarios.signals import until_stopped
 from scenarios.table import Table
 from scenarios.terminal import Interrupted, SafeConsole, echo, progress_bar
+from tests.scenarios.conftest import QUICK, run_json
 from tests.waiting import PATIENCE_S, PAUSE, wait_until
 
 
@@ -126,13 +127,6 @@ def test_a_signal_that_comes_while_waiting_wakes():
     with until_stopped() as stop:
         threading.Timer(0.05, lambda: os.kill(os.getpid(), signal.SIGTERM)).start()
         assert stop.wait(PATIENCE_S)
-
-
-QUICK = ("--difficulty", "blind", "--bus", "memory", "--policy", "round_robin")
-
-
-def run_json(folder: Path) -> dict:
-    return json.loads((folder / "run.json").read_text(encoding="utf-8"))
 
 
 def test_ctrl_c_while_working_keeps_what_was_done_and_the_same_command_replaces_it(

@@ -96,17 +96,13 @@ def test_results_say_how_they_were_randomised(thermofleet, small_toml, tmp_path)
     ("given", "message"),
     [
         (["ambient_k"], r"--randomise must be FIELD=VALUE in TOML, as in .+ \(got 'ambient_k'\)"),
-        ([""], r"--randomise must be FIELD=VALUE in TOML, as in .+ \(got ''\)"),
         (["arrivals=[1,2]", "# ambient_k=[1,2]"], r"--randomise must be FIELD=VALUE in TOML"),
-        (["ambient_k=[1,2"], r"--randomise must be FIELD=VALUE in TOML"),
         (["ambient=[1,2]"], "--randomise has no field 'ambient'; did you mean 'ambient_k'"),
         (["arrivals=[1,2]", "arrivals=[1,3]"], "--randomise arrivals is given twice"),
         (["ambient_k=[2,1]"], r"--randomise ambient_k must be two finite numbers, low <= high \(got \[2, 1\]\)"),
-        (["ambient_k=5"], r"--randomise ambient_k must be two finite numbers, low <= high \(got 5\)"),
         (["ambient_k=[0,1" + "0" * 400 + "]"], "--randomise ambient_k must be two finite numbers"),
         (["arrivals=[0,1]"], "--randomise arrivals must be > 0 and at most 100"),
         (["variants=[]"], r"--randomise changes nothing \(got 'variants=\[\]'\); leave it out"),
-        (["ambient_k=[0,0]"], "--randomise changes nothing"),
         (["variants={slots=3}"], "--randomise variants must be a list of dictionaries"),
     ],
 )
@@ -135,8 +131,6 @@ def test_commands_refuse_what_cannot_be_randomised(thermofleet, small_toml, tmp_
         (("compare", small_toml, "--randomise", "variants=[{slots=3}]"), "a variant must keep the slots"),
         (("compare", small_toml, "--randomise", "x=1"), "--randomise has no field 'x'"),
         (("train", small_toml, "--randomise", "x=1"), "--randomise has no field 'x'"),
-        (("compare", small_toml, "--randomise", ""), "--randomise must be FIELD=VALUE in TOML"),
-        (("train", small_toml, "--randomise", ""), "--randomise must be FIELD=VALUE in TOML"),
         (("train", "--suite", "train", "--randomise", "ambient_k=[0,1]"), "the instances of --suite are fixed"),
     ):
         said = thermofleet(*words)

@@ -25,7 +25,6 @@ from scenarios.prepare.arms import plan_arms
 from scenarios.prepare.fleet import prepare
 from scenarios.processes import Queue
 from scenarios.show.comparison_page import result_text
-from scenarios.spec.load import load
 from scenarios.spec.parse import override
 from scenarios.spec.schema import Scenario
 from tests.own_policies import IDLE
@@ -53,11 +52,6 @@ class DiesInOne(Idle):
         return {}
 """
 )
-
-
-@pytest.fixture
-def scenario(small_toml: Path) -> Scenario:
-    return load(small_toml)
 
 
 @pytest.fixture
@@ -359,10 +353,8 @@ def test_the_command_tells_every_scenario_and_goes_on_in_its_folder(thermofleet,
     assert len(read_rows(out)) == 14
     for wrong, sentence in (
         ((), "Give either scenarios or --suite."),
-        ((small_toml, "--suite", "test"), "Give either scenarios or --suite."),
         ((small_toml, "--workers", "2", "--ray", "auto"), "Give either --workers or --ray."),
         ((small_toml, "--references", "none.jsonl"), "There is no file of references 'none.jsonl'"),
-        ((small_toml, "--difficulty", "blind,oracel"), "No difficulty 'oracel'; did you mean 'oracle'?"),
     ):
         said = thermofleet("compare", *wrong)
         assert said.code != 0
