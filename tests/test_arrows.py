@@ -43,9 +43,14 @@ def imports(path: Path, *, on_load: bool = False) -> tuple[str, ...]:
 
 
 @cache
+def tree_of(file: Path) -> ast.Module:
+    return ast.parse(file.read_text(encoding="utf-8"))
+
+
+@cache
 def read_imports(file: Path, module: str, on_load: bool) -> tuple[str, ...]:
     package = module if file.name == "__init__.py" else module.rpartition(".")[0]
-    tree = ast.parse(file.read_text(encoding="utf-8"))
+    tree = tree_of(file)
     names = []
     for node in run_on_load(tree) if on_load else ast.walk(tree):
         if isinstance(node, ast.Import):

@@ -63,16 +63,12 @@ def test_a_curve_reads_as_numpy_interpolates(score) -> None:
 
 
 @given(several=st.lists(risks, min_size=1, max_size=5), temp_c=temps)
-def test_stacked_risks_say_what_each_said(several, temp_c) -> None:
+def test_stacked_risks_and_many_temperatures_say_what_each_said(several, temp_c) -> None:
     stack = stack_forecasts(several)
     assert stack.at(temp_c) == pytest.approx([float(r.at(temp_c)) for r in several])
+    assert several[0].at(np.tile(temp_c, (2, 3, 1))) == pytest.approx(np.full((2, 3), float(several[0].at(temp_c))))
     order = np.arange(len(several))[::-1]
     assert stack[order].at(np.tile(temp_c, (len(several), 1))) == pytest.approx(stack.at(temp_c)[::-1])
-
-
-@given(risk=risks, temp_c=st.lists(temps, min_size=1, max_size=4))
-def test_one_risk_serves_many_temperatures(risk, temp_c) -> None:
-    assert risk.at(np.array([temp_c])).tolist() == [[pytest.approx(float(risk.at(t))) for t in temp_c]]
 
 
 @pytest.mark.parametrize(

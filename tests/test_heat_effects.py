@@ -42,12 +42,6 @@ def test_a_winding_at_the_temperature_of_its_class_lasts_its_rated_life() -> Non
     assert arrhenius_rate(RATED_C + HALVING_K) == pytest.approx(2.0)
 
 
-def test_the_activation_energy_is_in_the_range_of_insulating_materials() -> None:
-    """0.8 to 1.3 eV for enamels and resins (Dakin 1948 gives 1.0 eV for class A); k = 8.617e-5 eV/K."""
-    activation_ev = ACTIVATION_K * 8.617333262e-5
-    assert activation_ev == pytest.approx(1.12, abs=0.01)
-
-
 def test_far_below_the_class_ageing_is_slower_than_by_the_rule_of_ten_kelvin() -> None:
     """Montsinger's rule: the life halves with every 10 K. The interval of Arrhenius is about E⁻¹ k T² ln 2: 6 K."""
     cool_c = np.linspace(20.0, 150.0, 14)

@@ -31,15 +31,6 @@ def test_own_policy_finishes_a_shift(capsys) -> None:
 
 
 @pytest.mark.ci_slow
-def test_own_policy_is_compared_beside_the_rules() -> None:
-    own = f"{ROOT / 'examples' / 'own_policy.py'}:Careful"
-    options = ["--policies", f"least_difficulty,{own}", "--baseline", "least_difficulty", "--seeds", "2"]
-    done = commands.run("compare", "quickstart", *options, "--difficulty", "oracle")
-    assert done.returncode == 0, done.stderr
-    assert "Careful" in done.stdout
-
-
-@pytest.mark.ci_slow
 def test_the_monitor_receives_every_arm_from_another_process(tmp_path) -> None:
     port = free_port()
     with started(program("monitor", port)) as monitor:

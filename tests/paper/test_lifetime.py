@@ -5,10 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.paper import drift
 from benchmarks.paper.drift import (
-    ALWAYS,
-    COOLING,
     D_CAL,
     NEVER,
     P_VALUE,
@@ -19,7 +16,6 @@ from benchmarks.paper.drift import (
     DriftSize,
     cool_jobs,
     delay_days,
-    drift_rows,
     drift_tables,
     with_cooling,
     work_days,
@@ -156,32 +152,6 @@ def test_only_jobs_that_stayed_cool_over_the_horizon_are_learned_from(study):
     assert all(day.peak_c[i].max() <= study.cool_c for day, i in recent)
     chosen = {(id(day), i) for day, i in recent}
     assert not any(day.peak_c[i].max() <= study.cool_c for day in days for i in range(6) if (id(day), i) not in chosen)
-
-
-@pytest.mark.slow
-def test_no_retraining_learns_from_hot_work(monkeypatch):
-    learned = []
-
-    def spy(name):
-        real = getattr(drift, name)
-
-        def call(twin, recent, *rest):
-            learned.extend((day, i) for day, i in recent)
-            return real(twin, recent, *rest)
-
-        monkeypatch.setattr(drift, name, call)
-
-    spy("retrain_learned")
-    spy("reidentify")
-    wanted = [f"{kind}/{policy}" for kind in (WEAR, COOLING) for policy in (NEVER, ALWAYS)]
-    lives = [row for _, row in drift_rows(1, SMALL, wanted)]
-    cool_c = make_study(np.random.SeedSequence(0), train=0, reference=0, test=0, novel=0).cool_c
-    assert learned
-    assert max(float(day.peak_c[i].max()) for day, i in learned) <= cool_c
-    for life in lives:
-        assert bool(life["retrainings"]) == (life["policy"] == ALWAYS)
-        assert all(each["hottest_c"] <= cool_c and each["cpu_s"] > 0 for each in life["retrainings"])
-        assert {each["watched"] for each in life["retrainings"]} <= {P_VALUE, THERMAL}
 
 
 def test_synthetic_motion_is_predicted_to_stay_cool(twin, study):

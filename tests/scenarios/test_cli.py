@@ -24,7 +24,7 @@ from fleet.errors import MAX_NAME, FleetError
 from fleet.fields import check, option, options_of
 from fleet.robot import ThermalLimits
 from scenarios.cli.main import COMMANDS, GROUPS, MOVED, load_command
-from scenarios.cli.options import From, Given, channel_of, flags_of, with_fields
+from scenarios.cli.options import From, Given, flags_of, with_fields
 from scenarios.live.gateway import ROLES
 from scenarios.run.log import FILES
 from scenarios.spec.load import library, load
@@ -83,14 +83,11 @@ def test_json_is_one_object_of_a_run_which_goes_into_runs_and_is_kept_without_ov
     assert changed.read_bytes() != b""
 
 
-def test_list_names_every_scenario_of_the_library(thermofleet):
+def test_show_lists_the_library_the_cells_and_the_instances_of_a_split(thermofleet):
     said = thermofleet("show")
     assert said.code == 0
     assert all(name in said.out for name in library())
     assert set(json.loads(thermofleet("show", "--json").out)) == set(library())
-
-
-def test_show_lists_the_cells_and_the_instances_of_a_split(thermofleet):
     names = [row["name"] for row in json.loads(thermofleet("show", "--suite", "test", "--json").out)]
     assert names[:2] == ["test/0000", "test/0001"]
     assert all(name in thermofleet("show", "--suite", "test").out for name in names[:2])
@@ -362,10 +359,7 @@ def test_a_command_receives_given_values_and_no_defaults():
     assert run("--heat-c", "90", "--twice") == {"heat_c": 90.0}
     assert run("--shelf", "1", "--shelf", "3", "--clean") == {"shelves": (1, 3), "clean": True}
     assert run("--mode", "fan") == {"mode": "fan"}  # given, although it is the default
-
-
-def test_a_command_may_have_another_default():
-    assert run(heat_c=100.0) == {"heat_c": 100.0}
+    assert run(heat_c=100.0) == {"heat_c": 100.0}  # the command's own default
     assert run("--heat-c", "90", heat_c=100.0) == {"heat_c": 90.0}
 
 
@@ -430,7 +424,6 @@ def test_defaults_that_the_help_states_are_those_of_the_modules_that_it_does_not
 
 BLIND = ("--difficulty", "blind", "--policy", "least_difficulty")
 HARD = ("--topology", "line", "--delay-s", 20, "--jitter-s", 5, "--loss", 0.2, "--partition", "30:60:left|right")
-CUTS = (Partition(0.0, 10.0, (("left",),)), Partition(20.0, 30.0, (("right",),)))
 
 
 def test_a_partition_is_read_from_a_text():
@@ -439,12 +432,6 @@ def test_a_partition_is_read_from_a_text():
     for text in ("", "600", "600:1200", "a:b:left", "1200:600:left|right", "0:10:left|", "0:10:a,a"):
         with pytest.raises(ValueError, match=r"partition .*\(got|names 'a' twice"):
             Partition.parse(text)
-
-
-def test_options_make_a_channel(small_toml):
-    made = channel_of(load(small_toml), partitions=CUTS, topology="ring", delay_s=3.0)
-    assert made == Channel(topology="ring", delay_s=3.0, partitions=CUTS)
-    assert channel_of(load(small_toml)).perfect
 
 
 def test_a_run_records_its_channel_and_is_the_same_over_either_bus(thermofleet, small_toml, tmp_path):

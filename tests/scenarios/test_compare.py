@@ -68,19 +68,6 @@ def test_what_takes_no_time_needs_no_worker(scenario, plans, monkeypatch):
     assert [share for stage, share in told if stage == "comparing"] == [0.5, 1.0]
 
 
-def test_figures_are_means_over_seeds_with_intervals_around_them(scenario, plans):
-    result = compared(scenario, plans, workers=1)
-    assert result.seeds == (0, 1, 2)
-    assert set(result.figures) == set(POLICIES)
-    for figures in result.figures.values():
-        assert set(figures) == set(FIGURES)
-        for figure in figures.values():
-            assert figure.low <= figure.mean <= figure.high or "no variation in 3" in figure.note
-            assert figure.difference_low <= figure.difference <= figure.difference_high or figure.difference_note
-    random, base = result.figures["random"]["peak_c"], result.figures["round_robin"]["peak_c"]
-    assert random.difference == pytest.approx(random.mean - base.mean)
-
-
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [

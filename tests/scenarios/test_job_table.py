@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 
 from fleet.errors import FleetError, ScenarioError
 from fleet.job import Job
-from fleet.seeding import shift_seeds
 from scenarios.extras import MissingExtra
 from scenarios.live.auctioneer import job_spec
 from scenarios.live.requests import read_jobs
@@ -90,20 +89,6 @@ def test_a_table_written_from_the_jobs_of_streams_gives_the_same_jobs(tmp_path_f
     assert drawn(with_table(folder / "cell.toml", text, "jobs.csv"), seed + 1) == jobs
 
 
-def test_a_table_gives_the_shift_of_the_streams_that_it_was_written_from(tmp_path, small_toml, plans):
-    streams = load(small_toml)
-    jobs = draw_jobs(streams, shift_seeds(np.random.SeedSequence(3))[0])
-    write(tmp_path / "jobs.csv", [cells_of(job) for job in jobs])
-    logs = []
-    for scenario in (streams, with_table(tmp_path / "cell.toml", SMALL, "jobs.csv")):
-        fleet = prepare(scenario, difficulty="blind", cache=plans)
-        logs.append(run(fleet, policy="edd", difficulty="blind", seed=3))
-    assert len(logs[0].jobs) == len(jobs) > 3
-    assert logs[0].jobs == logs[1].jobs
-    assert repr(logs[0].events) == repr(logs[1].events)
-    np.testing.assert_array_equal(logs[0].readings.temp_c, logs[1].readings.temp_c)
-
-
 BEGIN = datetime(2026, 11, 23, 6, 0, tzinfo=timezone(timedelta(hours=1)))
 
 
@@ -123,11 +108,6 @@ def test_seconds_clock_times_and_dates_in_any_zone_name_one_moment(tmp_path_fact
     assert {job.release_s for job in read_job_table(folder / "jobs.csv", begin=BEGIN).values()} == {float(seconds)}
 
 
-def test_without_a_date_of_the_begin_clock_times_count_from_it(tmp_path):
-    text = f"{SHORT}\na,hold,bench,,,0:02,,,,\nb,hold,bench,,,0:01:30.5,,,,\n"
-    assert [job.release_s for job in drawn(small_table(tmp_path, text), 0)] == [90.5, 120.0]
-
-
 def test_the_begin_of_the_shift_is_a_date_of_toml_or_a_text(tmp_path):
     text = f"{SHORT}\na,hold,bench,,,2026-11-23T05:01Z,,,,\n"
     for begin in ("2026-11-23T06:00:00+01:00", '"2026-11-23T06:00+01:00"'):
@@ -137,19 +117,24 @@ def test_the_begin_of_the_shift_is_a_date_of_toml_or_a_text(tmp_path):
         assert "cell.toml: shift_begin must be a date with time and zone, as 2026-11-23T06:00+01:00 (got" in told
 
 
+@pytest.mark.parametrize(
+    ("rows", "jobs"),
+    [
+        (["a,hold,bench,,,0:02,,,,", "b,hold,bench,,,0:01:30.5,,,,"], [("b", (), 90.5), ("a", (), 120.0)]),
+        (["[A] 1/2,hold,bench,,,,,,,", "b,hold,shelf,,,,,,,[A] 1/2"], [("[A] 1/2", (), 0.0), ("b", ("[A] 1/2",), 0.0)]),
+        (["4711,hold,bench,,,,,,,", "4711-100,hold,bench,,,,,,,"], [("4711", (), 0.0), ("4711-100", (), 0.0)]),
+        (["a,hold,bench,,,0,,,,b", "b,hold,shelf,,,5,,,,"], [("a", ("b",), 0.0), ("b", (), 5.0)]),
+    ],
+    ids=["clock times without a date", "odd names", "a name that continues another", "waiting for a row below"],
+)
+def test_rows_give_jobs_in_order_of_release(tmp_path, rows, jobs):
+    scenario = small_table(tmp_path, "\n".join([SHORT, *rows]))
+    assert [(job.name, job.after, job.release_s) for job in drawn(scenario, 0)] == jobs
+
+
 def test_a_row_without_due_date_is_due_at_the_end_of_the_shift_and_defaults_are_those_of_a_job(tmp_path):
     (job,) = drawn(small_table(tmp_path, "name,kind,places\na,hold,bench\n"), 0)
     assert (job.due_s, job.value, job.repetitions, job.release_s, job.expires) == (180.0, 1.0, 1, 0.0, False)
-
-
-def test_names_are_those_of_the_table(tmp_path):
-    first, second = drawn(small_table(tmp_path, f"{SHORT}\n[A] 1/2,hold,bench,,,,,,,\nb,hold,shelf,,,,,,,[A] 1/2\n"), 0)
-    assert (first.name, second.after) == ("[A] 1/2", ("[A] 1/2",))
-
-
-def test_names_may_continue_those_of_other_rows(tmp_path):
-    jobs = drawn(small_table(tmp_path, "name,kind,places\n4711,hold,bench\n4711-100,hold,bench\n"), 0)
-    assert [job.name for job in jobs] == ["4711", "4711-100"]
 
 
 @pytest.mark.parametrize("line", ["horizon_s = 1_0E999", "horizon_s = nan", 'horizon_s = "x"', "places = 3"])
@@ -160,11 +145,6 @@ def test_a_wrong_scenario_around_a_table_is_told(tmp_path, line):
     (tmp_path / "jobs.csv").write_text("name,kind,places\na,hold,bench\n", encoding="utf-8")
     with pytest.raises(ScenarioError, match=r"^cell\.toml: "):
         with_table(tmp_path / "cell.toml", text, "jobs.csv")
-
-
-def test_rows_may_wait_for_rows_below_them(tmp_path):
-    jobs = drawn(small_table(tmp_path, f"{SHORT}\na,hold,bench,,,0,,,,b\nb,hold,shelf,,,5,,,,\n"), 0)
-    assert [(job.name, job.after) for job in jobs] == [("a", ("b",)), ("b", ())]
 
 
 def test_parquet_and_xlsx_have_the_jobs_of_the_csv(tmp_path, caplog):

@@ -60,7 +60,7 @@ def test_breaks_leave_less_time_and_the_same_heat(small):
     assert (less.thermal, less.blind) == pytest.approx((whole.thermal, whole.blind))
 
 
-@pytest.mark.parametrize("count", [2, 3, 4])
+@pytest.mark.parametrize("count", [2, 4])
 def test_equal_arms_share_the_load_evenly(small, count):
     content = small.work(payload_kg=small.WARM)
     alone = load_of(small, [small.job("a", content)], equal_arms(small, 1, content))
@@ -100,15 +100,6 @@ def test_a_job_that_one_arm_cannot_do_loads_the_other_and_twice_the_jobs_are_twi
     jobs = [small.job(f"job_{i}", content) for i in range(4)]
     assert load_of(small, jobs, arms).thermal == pytest.approx(2 * load_of(small, jobs[:2], arms).thermal)
     assert load_of(small, [], arms) == LoadFactor(thermal=0.0, blind=0.0, time=0.0, able=0.0)
-
-
-def test_heavier_is_never_cooler(small):
-    loads = []
-    for kg in (small.LIGHT, small.WARM, small.HOT):
-        content = small.work(payload_kg=kg)
-        loads.append(load_of(small, [small.job("a", content)], equal_arms(small, 1, content)).thermal)
-    assert loads == sorted(loads)
-    assert loads[0] < loads[2]
 
 
 def test_the_best_assignment_is_one_that_the_arms_have_time_for(small):

@@ -87,9 +87,7 @@ def test_nothing_better_near_is_said(subject, asked):
 
 
 @pytest.mark.ci_slow
-@pytest.mark.parametrize(
-    "hold_s", [120.0, pytest.param(240.0, marks=pytest.mark.slow), pytest.param(600.0, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("hold_s", [120.0, pytest.param(600.0, marks=pytest.mark.slow)])
 def test_every_allowed_time_of_a_hold_can_be_recovered(subject, asked, hold_s):
     """Also those longer than a hand takes to close or open, LONGEST_GRASP_S."""
     q = np.deg2rad(HOLDS["reaching"][0])

@@ -108,16 +108,10 @@ def test_an_arm_explores_with_light_motion_that_stays_cool_on_its_own_mount(scen
     assert max(np.abs(record[:, 2, 1]).max() for record in explored) < 25.0  # light: no outstretched load
 
 
-def test_exploration_that_gets_hot_is_left_out(scenario):
-    (arm,) = arms(1)
-    strict = replace(scenario, twin=replace(scenario.twin, cool_c=22.5))
-    assert rehearse.exploration_records(strict, arm) == []
-
-
 def test_an_arm_that_does_not_explore_learns_from_its_work_alone(plans, scenario, tmp_path, tiny):
-    none = replace(scenario, twin=replace(scenario.twin, exploration=0))
     (arm,) = arms(1)
-    assert rehearse.exploration_records(none, arm) == []
+    none, strict = (replace(scenario, twin=replace(scenario.twin, **n)) for n in ({"exploration": 0}, {"cool_c": 22.5}))
+    assert rehearse.exploration_records(none, arm) == rehearse.exploration_records(strict, arm) == []
     (twin,) = rehearse.train_twins(none, arms(1, plans), tmp_path, silent)
     (explorer,) = rehearse.train_twins(scenario, arms(1, plans), tmp_path, silent)
     own = records(require_cool_plans(arms(1, plans)[0].all_plans, hardware(), none))

@@ -14,7 +14,7 @@ from scenarios.evaluate.runner import run_study
 from scenarios.evaluate.study import Study, suite_of
 from scenarios.prepare.fleet import prepare
 from scenarios.spec.jobs import all_works, alternatives_of
-from scenarios.spec.load import load
+from scenarios.spec.load import load, own_seed
 from scenarios.spec.parse import scenario_content
 from scenarios.spec.schema import SPLITS, Scenario
 from scenarios.suite.instances import (
@@ -133,6 +133,7 @@ def test_a_default_changes_no_hash() -> None:
 def test_an_instance_is_loaded_by_name() -> None:
     first = split("test")[0]
     assert load("test/0000") == first.scenario == instance("test/0000").scenario
+    assert (own_seed("test/0003"), own_seed("heat_wave")) == (manifest("test")[3].seed, 0)
     with pytest.raises(ScenarioError, match=r"No instance 'test/9999' in the suite; they are test/0000 to test/0"):
         load("test/9999")
     with pytest.raises(ScenarioError, match="split"):

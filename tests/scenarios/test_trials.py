@@ -18,7 +18,7 @@ from scenarios.evaluate import runner, sources
 from scenarios.evaluate.comparison import comparison_of, comparisons
 from scenarios.evaluate.rollout import FIGURES, outcomes
 from scenarios.evaluate.store import RESULTS, UNFINISHED, opened, read_rows
-from scenarios.evaluate.study import Case, Row, RowKey, Study, Unit, policy_hash, seeds_of_instance
+from scenarios.evaluate.study import Case, RowKey, Study, Unit, policy_hash, seeds_of_instance
 from scenarios.policy_loader import label
 from scenarios.prepare import fleet as preparing
 from scenarios.prepare.arms import plan_arms
@@ -325,13 +325,6 @@ def test_a_worker_stays_with_its_group_and_helps_others_at_the_end(scenario):
     left = [queue.take(first.group) for _ in range(4)]
     assert [(work.unit.case.seeds, work.deaths) for work in left] == [((5,), 1), ((6,), 1), ((0,), 0), ((0,), 0)]
     assert not queue
-
-
-def test_a_row_without_outcome_has_a_sentence():
-    row = Row(RowKey("p", "i", 0, 0, "blind", 1), None, error="It died.")
-    from scenarios.evaluate.study import columns, row_of
-
-    assert row_of(columns(row)) == row
 
 
 @pytest.mark.ci_slow
