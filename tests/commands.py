@@ -14,6 +14,8 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -100,6 +102,24 @@ def run(*words: object, timeout_s: float = 300.0, **options: Any) -> subprocess.
             process.kill()
             raise
     return subprocess.CompletedProcess(words, process.returncode, out, err)
+
+
+@contextmanager
+def ready(*words: object, **options: Any) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A command until the end of the block, and the line that it prints when it is ready."""
+    with start(*words, **options) as process:
+        assert process.stdout is not None
+        try:
+            yield process, process.stdout.readline().strip()
+        finally:
+            process.kill()
+
+
+def end(process: subprocess.Popen[str], number: int) -> tuple[int, str]:
+    """Send a signal; return the exit code and the errors that were printed."""
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=300.0)
+    return process.returncode, errors
 
 
 def _serve(listener: socket.socket) -> dict[str, Any]:

@@ -89,13 +89,10 @@ def test_the_drift_is_that_of_a_model_with_longer_links() -> None:
     assert np.linalg.norm(stretched) == pytest.approx(most_drift_m(rise_k), rel=0.01)
 
 
-def test_a_uniformly_warm_arm_grows_like_a_rod() -> None:
+def test_a_segment_has_the_mean_temperature_of_its_ends_and_a_warm_arm_grows_like_a_rod() -> None:
     segments_c = segment_temperatures(np.full((5, JOINTS), 45.0))
     assert segments_c.shape == (5, SEGMENTS)
     assert most_drift_m(segments_c - 25.0) == pytest.approx(23.6e-6 * 20.0 * sum(GEN3_SEGMENTS_M))
-
-
-def test_a_segment_has_the_mean_temperature_of_its_ends() -> None:
     segments_c = segment_temperatures(np.arange(20.0, 90.0, 10.0))
     assert segments_c.tolist() == [20.0, 25.0, 35.0, 45.0, 55.0, 65.0, 75.0, 80.0]
 

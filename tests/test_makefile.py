@@ -39,33 +39,30 @@ def stub(tmp_path: Path) -> Path:
     return script(tmp_path / "python3", body)
 
 
-@pytest.mark.parametrize("goal", ["test", "demo"])
-def test_no_python_at_all(tmp_path, goal):
-    said = make(goal, tmp_path / "venv", "missing-python")
+NEEDS = "thermofleet needs Python 3.11 or newer, and "
+ANOTHER = "make test PYTHON=/path/to/python3.11\n"
+NO_VENV = 'case "$1 $2" in "-m venv") mkdir -p "$3/bin"; touch "$3/bin/python"; echo Traceback >&2; exit 1;; esac'
+
+
+@pytest.mark.parametrize(
+    ("body", "says"),
+    [
+        (None, f"{NEEDS}there is no '{{python}}' here. Install it, or name one: {ANOTHER}"),
+        (
+            'case "$1" in -c) exit 1;; --version) echo Python 3.8.10;; esac',
+            f"{NEEDS}'{{python}}' is Python 3.8.10. Name another: {ANOTHER}",
+        ),
+        (NO_VENV, "could not make an environment. On Debian and Ubuntu the package python3-venv is missing"),
+    ],
+    ids=["none", "too old", "without venv"],
+)
+def test_a_python_that_makes_no_environment(tmp_path, body, says):
+    python = tmp_path / "python3"
+    if body is not None:
+        script(python, body)
+    said = make("test", tmp_path / "venv", python)
     assert said.returncode != 0
-    assert said.stdout == (
-        "thermofleet needs Python 3.11 or newer, and there is no 'missing-python' here. Install it, or name one: "
-        f"make {goal} PYTHON=/path/to/python3.11\n"
-    )
-    assert not (tmp_path / "venv").exists()
-
-
-def test_a_python_that_is_too_old(tmp_path):
-    old = script(tmp_path / "python3.8", 'case "$1" in -c) exit 1;; --version) echo Python 3.8.10;; esac')
-    said = make("test", tmp_path / "venv", old)
-    assert said.returncode != 0
-    assert said.stdout == (
-        f"thermofleet needs Python 3.11 or newer, and '{old}' is Python 3.8.10. Name another: "
-        "make test PYTHON=/path/to/python3.11\n"
-    )
-    assert not (tmp_path / "venv").exists()
-
-
-def test_a_python_without_venv(tmp_path):
-    body = 'case "$1 $2" in "-m venv") mkdir -p "$3/bin"; touch "$3/bin/python"; echo Traceback >&2; exit 1;; esac'
-    said = make("test", tmp_path / "venv", script(tmp_path / "python3", body))
-    assert said.returncode != 0
-    assert "could not make an environment. On Debian and Ubuntu the package python3-venv is missing" in said.stdout
+    assert says.format(python=python) in said.stdout
     assert "Traceback" not in said.stdout + said.stderr
     assert not (tmp_path / "venv").exists()
 

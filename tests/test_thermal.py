@@ -84,15 +84,12 @@ def test_wear_increases_friction(wear, qd):
     assert np.all(reference_current(REST, speed, worn) > reference_current(REST, speed, MOTORS))
 
 
-def test_stacked_arms_keep_their_own_numbers():
+def test_stacked_arms_keep_their_own_numbers_and_share_constants():
     worn = gen3_motors(wear=0.5)
     both = stack_motors([MOTORS, worn])
     speed = np.full((2, JOINTS), 0.7)
     np.testing.assert_array_equal(friction_torque(speed, both)[0], friction_torque(speed[0], MOTORS))
     np.testing.assert_array_equal(friction_torque(speed, both)[1], friction_torque(speed[1], worn))
-
-
-def test_stacking_refuses_arms_with_different_constants():
     with pytest.raises(ValueError, match="alpha_cu_per_k"):
         stack_motors([MOTORS, replace(MOTORS, alpha_cu_per_k=0.004)])
     with pytest.raises(ValueError, match="at least one arm"):
@@ -386,24 +383,24 @@ def test_several_arms_step_as_each_alone():
         np.testing.assert_allclose(steady[k], model.steady(heat_w[k], ambient_c[k]), rtol=1e-12)
 
 
-def test_a_node_without_a_path_to_ambient_is_refused():
-    graph = gen3_network()
-    graph.remove_edge(housing(2), "ambient")
-    thermal_model(graph)  # Its neighbours still carry its heat away.
-    graph.remove_edge(housing(1), housing(2))
-    graph.remove_edge(housing(2), housing(3))
-    with pytest.raises(ValueError, match="Nodes without a path to ambient: winding_3, housing_3"):
-        thermal_model(graph)
+def without_housing_3(graph: nx.Graph) -> None:
+    """Cut what leads from housing 3 to ambient and to its neighbours, which would carry its heat away."""
+    for neighbour in ("ambient", housing(1), housing(3)):
+        graph.remove_edge(housing(2), neighbour)
 
 
-def test_missing_or_foreign_parts_are_named():
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (without_housing_3, "Nodes without a path to ambient: winding_3, housing_3"),
+        (lambda graph: graph.add_node("gripper", capacity_j_per_k=100.0), "gripper"),
+        (lambda graph: graph.remove_node(winding(4)), "lacks the nodes winding_5"),
+    ],
+)
+def test_missing_and_foreign_parts_of_a_network_are_named(change, says):
     graph = gen3_network()
-    graph.add_node("gripper", capacity_j_per_k=100.0)
-    with pytest.raises(ValueError, match="gripper"):
-        thermal_model(graph)
-    graph = gen3_network()
-    graph.remove_node(winding(4))
-    with pytest.raises(ValueError, match="lacks the nodes winding_5"):
+    change(graph)
+    with pytest.raises(ValueError, match=says):
         thermal_model(graph)
 
 

@@ -8,15 +8,10 @@ import numpy as np
 import pytest
 
 from benchmarks.paper import harness, sweep
-from benchmarks.paper.__main__ import STUDIES, main
 from benchmarks.paper.harness import Experiment, Unit, compute, mean_by_group, one_row, seeded, table_of, wholes
-from benchmarks.paper.subjects import Sizes, subjects_of
 from benchmarks.paper.sweep import (
     OURS,
     SWEEP,
-    Configuration,
-    key_of,
-    sweep_rows,
     sweep_tables,
     train_regressor,
 )
@@ -51,16 +46,6 @@ def test_a_stopped_study_continues_with_the_missing_rows(tmp_path, capsys) -> No
     assert capsys.readouterr().err == ""
 
 
-def test_rows_are_kept_one_by_one(tmp_path) -> None:
-    def stops(missing):
-        yield "a", {"value": 1}
-        raise FleetError("no more")
-
-    with pytest.raises(FleetError):
-        compute([Unit(("a", "b"), stops)], Rows(tmp_path / "rows.jsonl"))
-    assert list(Rows(tmp_path / "rows.jsonl").by_key) == ["a"]
-
-
 def test_values_and_files_that_hold_no_rows_are_refused(tmp_path) -> None:
     with pytest.raises(NotImplementedError, match="A row cannot hold a object"):
         harness.plain({"value": object()})
@@ -70,15 +55,6 @@ def test_values_and_files_that_hold_no_rows_are_refused(tmp_path) -> None:
     )
     with pytest.raises(FleetError, match="has a missing or odd value"):
         harness.run("nothing", experiment, ["--show", "--out", str(tmp_path / "rows.jsonl")])
-
-
-def test_tables_are_printed_with_their_captions(tmp_path, capsys) -> None:
-    tables = {name: table_of(("name", "n"), [(name, "10"), ("longer", "2")], "Numbers") for name in ("a", "b")}
-    study = Experiment(help="", units=lambda given: [one_row("a", dict)], tables=lambda rows: tables)
-    harness.run("numbers", study, ["--out", str(tmp_path / "rows.jsonl")])
-    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    first = [["Numbers"], ["name", "n"], ["a", "10"], ["longer", "2"]]
-    assert lines == [*first, [], *first[:2], ["b", "10"], first[3]]
 
 
 @dataclass(frozen=True)
@@ -138,47 +114,10 @@ def test_errors_are_a_sentence(tmp_path, capsys) -> None:
         assert text in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", STUDIES)
-def test_every_study_has_help(name, capsys) -> None:
-    with pytest.raises(SystemExit) as end:
-        main([name, "--help"])
-    assert end.value.code == 0
-    assert STUDIES[name]().help.splitlines()[0][:40] in capsys.readouterr().out.replace("\n", " ")
-
-
 def test_groups_are_the_sample_if_there_are_several() -> None:
     values = [("a", 1.0), ("a", 3.0), ("b", 5.0), ("c", 5.0), ("c", 6.0)]
     assert mean_by_group(values) == interval([2.0, 5.0, 5.5])
     assert mean_by_group(values[:2]) == interval([1.0, 3.0])
-
-
-TINY = {"hidden": 4, "max_windows": 32, "epochs": 1, "batch": 32}
-TWO = {OURS: Configuration("ours", "tiny", TINY), "short": Configuration("window", "1 s", {**TINY, "window": 12})}
-
-
-@pytest.fixture(scope="module")
-def subjects():
-    return subjects_of(["heat_wave"], arms=[0], seeds=[1, 2], sizes=Sizes(train=10, test=60))
-
-
-def rows_of(subject, configurations):
-    keys = [key_of(name, each.config, subject) for name, each in configurations.items()]
-    return [row for _, row in sweep_rows(subject, configurations, keys)]
-
-
-@pytest.mark.ci_slow
-def test_only_the_asked_rows_are_trained(subjects, monkeypatch):
-    trained = []
-    monkeypatch.setattr(sweep, "train", lambda *args, **names: trained.append(1) or train(*args, **names))
-    both = rows_of(subjects[0], TWO)
-    assert len(trained) == len(both) == 2
-    ((key, alone),) = sweep_rows(subjects[0], TWO, [key_of("short", TWO["short"].config, subjects[0])])
-    assert len(trained) == 3
-    assert key.startswith("short/heat_wave/front_left/1/")
-    assert {**alone, "cpu_s": 0} == {**both[1], "cpu_s": 0}
-
-
-train = sweep.train
 
 
 def made_up(configuration: str, subject: str, auroc: float) -> dict:

@@ -1,17 +1,14 @@
 """`thermofleet bus keys`, `bus router` and `bus ros2`, in this process and as processes."""
 
 import json
-import os
 import re
 import shlex
 import shutil
 import signal
 import socket
-import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 from itertools import count
 from pathlib import Path
@@ -37,17 +34,6 @@ from tests import commands
 from tests.waiting import PATIENCE_S, wait_until
 
 
-@contextmanager
-def started(*words: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """The router as a process, and the line that it prints when it listens."""
-    with commands.start("bus", "router", *words) as process:
-        assert process.stdout is not None
-        try:
-            yield process, process.stdout.readline().strip()
-        finally:
-            process.kill()
-
-
 @pytest.fixture(scope="module")
 def made_keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("made") / "keys"
@@ -65,7 +51,7 @@ def folder(tmp_path: Path, made_keys: Path) -> Path:
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
 def test_a_router_prints_its_endpoint_and_exits_on_a_signal(number, code):
-    with started("--port", 0) as (process, endpoint):
+    with commands.ready("bus", "router", "--port", 0) as (process, endpoint):
         assert endpoint.startswith("tcp/127.0.0.1:")
         with open_client(endpoint, timeout_s=PATIENCE_S):
             process.send_signal(number)
@@ -77,7 +63,8 @@ def test_a_router_prints_its_endpoint_and_exits_on_a_signal(number, code):
 
 
 def test_a_router_with_tls_enforces_access_and_the_state_rate(folder):
-    with started("--port", 0, "--tls", folder, "--scenario", "quickstart", "--state-hz", 5) as (process, endpoint):
+    options = ("--port", 0, "--tls", folder, "--scenario", "quickstart", "--state-hz", 5)
+    with commands.ready("bus", "router", *options) as (process, endpoint):
         assert endpoint.startswith("tls/127.0.0.1:")
         with (
             open_client(endpoint, timeout_s=PATIENCE_S, tls=Tls(folder, "arm_0")) as arm,
@@ -278,33 +265,19 @@ def test_the_default_port_is_used_if_it_is_free():
 TEMP_C = (30.0, 31.0, 32.5, 33.0, 34.0, 35.0, 36.0)
 
 
-def ros2_started(stack, *words):
-    """A command that says it is ready."""
-    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    environment.pop("ROS_DOMAIN_ID", None)
-    process = stack.enter_context(commands.start("bus", "ros2", *words, env=environment))
-    stack.callback(process.kill)
-    assert process.stdout is not None
-    assert process.stdout.readline().startswith("ready ")
-    return process
-
-
-def ended(process, number):
-    process.send_signal(number)
-    _, said = process.communicate(timeout=PATIENCE_S)
-    return process.returncode, said
-
-
-def test_an_arm_is_published_in_ros_and_followed_again():
-    with ExitStack() as stack:
-        router = stack.enter_context(Router())
-        link = stack.enter_context(BusClient(router.endpoint, "shop"))
+def test_an_arm_is_published_in_ros_and_followed_again(monkeypatch):
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    monkeypatch.setenv("PYTHONUNBUFFERED", "1")
+    with Router() as router, BusClient(router.endpoint, "shop") as link, ExitStack() as stack:
         states: list[State] = []
         link.subscribe(keys.of_arm("shop", "mirror", "state"), State, lambda _, state: states.append(state))
         here = ["--endpoint", router.endpoint, "--fleet", "shop"]
-        bridge = ros2_started(stack, "bridge", *here)
-        listen = ros2_started(stack, "listen", "/shop/arm_0/joint_states", "--temperatures", "/diagnostics",
-                         "--hardware", "shop/arm_0", "--arm", "mirror", *here)  # fmt: skip
+        asked = ["--temperatures", "/diagnostics", "--hardware", "shop/arm_0", "--arm", "mirror", *here]
+        bridge, line = stack.enter_context(commands.ready("bus", "ros2", "bridge", *here))
+        assert line.startswith("ready ")
+        command = ("bus", "ros2", "listen", "/shop/arm_0/joint_states", *asked)
+        listen, line = stack.enter_context(commands.ready(*command))
+        assert line.startswith("ready ")
         ticks = count(1)
 
         def publish():
@@ -322,8 +295,8 @@ def test_an_arm_is_published_in_ros_and_followed_again():
             (0.2,) * 7,
             (),
         )
-        assert ended(listen, signal.SIGTERM) == (0, "")
-        assert ended(bridge, signal.SIGINT) == (130, "The bridge was interrupted.\n")
+        assert commands.end(listen, signal.SIGTERM) == (0, "")
+        assert commands.end(bridge, signal.SIGINT) == (130, "The bridge was interrupted.\n")
 
 
 def test_a_missing_extra_is_named(thermofleet, monkeypatch):

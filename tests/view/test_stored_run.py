@@ -71,36 +71,47 @@ def test_an_absent_arm_keeps_its_last_posture() -> None:
     assert arrays["mode"][1].tolist() == [[-1, 1, 1, 1, 1, 1], [1, 1, -1, -1, 1, 1]]
 
 
-@pytest.mark.parametrize("damage", ["jobs.parquet", "telemetry.parquet", "run.json", "list"])
-def test_a_damaged_run_is_refused_in_words(run_folder: Path, tmp_path: Path, damage: str) -> None:
+NO_RUN = "no complete folder of `thermofleet run`"
+
+
+def cut_short(file: Path) -> None:
+    file.write_bytes(b"PAR1 cut short")
+
+
+def without_rows(file: Path) -> None:
+    pq.write_table(pq.read_table(file).slice(0, 0), file)
+
+
+def of_a_ghost(events: Path) -> None:
+    table = pq.read_table(events)
+    ghosts = pa.array(["ghost"] * table.num_rows)
+    pq.write_table(table.set_column(table.column_names.index("arm"), "arm", ghosts), events)
+
+
+def of_an_earlier_environment(card: Path) -> None:
+    card.write_text(card.read_text(encoding="utf-8").replace('"allocation_v2"', '"allocation_v1"'), encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("damage", "file", "says"),
+    [
+        (cut_short, "jobs.parquet", NO_RUN),
+        (cut_short, "telemetry.parquet", NO_RUN),
+        (cut_short, "run.json", NO_RUN),
+        (lambda card: card.write_text("[6]"), "run.json", NO_RUN),
+        (without_rows, "telemetry.parquet", "has no rows"),
+        (of_a_ghost, "events.parquet", "No arm 'ghost'"),
+        (
+            of_an_earlier_environment, "run.json",
+            r"is a run of format 6 in allocation_v1; this version reads 6 in allocation_v2\.",
+        ),
+    ],
+)  # fmt: skip
+def test_a_damaged_run_is_refused_in_words(run_folder: Path, tmp_path: Path, damage, file: str, says: str) -> None:
     copied = shutil.copytree(run_folder, tmp_path / "run")
-    name, content = ("run.json", b"[6]") if damage == "list" else (damage, b"PAR1 cut short")
-    (copied / name).write_bytes(content)
-    with pytest.raises(FleetError, match="no complete folder of `thermofleet run`"):
+    damage(copied / file)
+    with pytest.raises(FleetError, match=says):
         open_run(copied)
-
-
-def test_a_run_in_another_version_of_the_environment_is_refused_by_name(run_folder: Path, tmp_path: Path) -> None:
-    copied = shutil.copytree(run_folder, tmp_path / "run")
-    card = json.loads((copied / "run.json").read_text(encoding="utf-8"))
-    assert card["environment"] == "allocation_v2"
-    (copied / "run.json").write_text(json.dumps(card | {"environment": "allocation_v1"}), encoding="utf-8")
-    with pytest.raises(
-        FleetError, match=r"is a run of format 6 in allocation_v1; this version reads 6 in allocation_v2\."
-    ):
-        open_run(copied)
-
-
-def test_a_run_without_readings_or_with_events_of_another_fleet_is_refused(run_folder: Path, tmp_path: Path) -> None:
-    telemetry, events = (pq.read_table(run_folder / f"{name}.parquet") for name in ("telemetry", "events"))
-    ghosts = pa.array(["ghost"] * events.num_rows)
-    damaged = {"telemetry": telemetry.slice(0, 0), "events": events.set_column(2, "arm", ghosts)}
-    assert events.schema.names[2] == "arm"
-    for name, table in damaged.items():
-        copied = shutil.copytree(run_folder, tmp_path / name)
-        pq.write_table(table, copied / f"{name}.parquet")
-        with pytest.raises(FleetError, match="has no rows" if name == "telemetry" else "No arm 'ghost'"):
-            open_run(copied)
 
 
 def test_the_report_written_anew_is_the_same(run_folder: Path, tmp_path: Path, thermofleet) -> None:
