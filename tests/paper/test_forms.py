@@ -20,7 +20,7 @@ def motion(rng: np.random.Generator, factor: float) -> np.ndarray:
 def test_a_network_that_knows_the_motion_explains_its_torque_and_no_other(name) -> None:
     rng = np.random.default_rng(0)
     known, payload = motion(rng, 1.0), np.zeros(256)
-    net = fitted(FORMS[name], known, payload, 1, np.zeros(3), 0, replace(CONFIG, epochs=100))
+    net = fitted(FORMS[name], known, payload, 1, np.zeros(3), 0, replace(CONFIG, epochs=50))
     usual, hotter = (errors_of(net, motion(rng, factor), payload, 1).mean() for factor in (1.0, 3.0))
     assert usual < 0.25 * np.abs(known[..., 1, 2]).mean()
     assert hotter > 2.0 * usual

@@ -21,9 +21,11 @@ from fleet.heat.thermal import ThermalSpread, gen3_network, spread_motors, therm
 from fleet.robot import Robot
 from scenarios.cli.main import main
 from scenarios.motion.generate import Verification, bare_arm
+from scenarios.policy_loader import policy_at
 from scenarios.prepare.twins import cold_peaks, records
 from scenarios.spec.load import load
 from scenarios.spec.schema import Scenario
+from tests.own_policies import BAD
 from twin.vae.config import TwinConfig
 from twin.vae.train import train
 
@@ -131,6 +133,16 @@ def scenario(small_toml: Path) -> Scenario:
 def asked(subject: SimpleNamespace) -> Verification:
     """What a motion of the subject is verified with."""
     return Verification.nominal(subject.arm.robot, 23.0)
+
+
+@pytest.fixture
+def bad(tmp_path: Path) -> Path:
+    """A file of policies that fail."""
+    path = tmp_path / "bad.py"
+    path.write_text(BAD.replace("DRAWN", "0.0"), encoding="utf-8")
+    drawn = policy_at(f"{path}:Idle", 1).drawn  # pyright: ignore[reportAttributeAccessIssue]  # of the file
+    path.write_text(BAD.replace("DRAWN", repr(drawn)), encoding="utf-8")
+    return path
 
 
 @pytest.fixture

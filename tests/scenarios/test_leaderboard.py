@@ -11,7 +11,6 @@ import pytest
 
 from docs.tables import board_text
 from fleet.errors import FleetError
-from scenarios.cli.main import main
 from scenarios.evaluate import leaderboard
 from scenarios.evaluate.leaderboard import (
     MOST_BYTES,
@@ -68,19 +67,13 @@ def finished(study: Study, out: Path, rewards: dict[str, float], failed: int = 0
     return out
 
 
-def run(*words: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([str(word) for word in words])
-    return int(ended.value.code or 0)
-
-
-def test_a_study_of_a_whole_split_becomes_a_file_for_each_policy_and_a_table(study, tmp_path, capsys):
+def test_a_study_of_a_whole_split_becomes_a_file_for_each_policy_and_a_table(study, tmp_path, thermofleet):
     out = finished(study, tmp_path / "study", {"wspt": 15.0, "wsept": 30.0}, failed=50)
     sent = tmp_path / "sent"
-    assert run("leaderboard", "--submit", out, "--author", "Ann", "--about", "rules", "--out", sent) == 0
+    said = thermofleet("leaderboard", "--submit", out, "--author", "Ann", "--about", "rules", "--out", sent)
+    assert (said.code, "50 failed shifts, which count as random" in said.err) == (0, True)
     assert sorted(path.name for path in sent.iterdir()) == ["test-wsept-oracle.jsonl", "test-wspt-oracle.jsonl"]
     assert all(path.stat().st_size < 200_000 for path in sent.iterdir())
-    assert "50 failed shifts, which count as random" in capsys.readouterr().err
     made = board_of("test", read_all(sent, "test"))
     assert made is not None
     assert made.order == ["test-wsept-oracle", "test-wspt-oracle"]
@@ -88,17 +81,16 @@ def test_a_study_of_a_whole_split_becomes_a_file_for_each_policy_and_a_table(stu
     assert scores["test-wspt-oracle"].mean.mean == pytest.approx(0.25)
     assert scores["test-wsept-oracle"].mean.mean == pytest.approx(0.75)  # 150 of 200 shifts at 1, the others at 0
     assert scores["test-wspt-oracle"].improvement.mean == 0.25
-    assert run("leaderboard", sent) == 0
-    assert "of 200 instances; differences to `wsept` (oracle)." in capsys.readouterr().out
-    assert run("leaderboard", "--submit", out, "--author", "Bob", "--out", sent) == 2
-    assert "has a result of Ann" in capsys.readouterr().err
+    assert "of 200 instances; differences to `wsept` (oracle)." in thermofleet("leaderboard", sent).out
+    said = thermofleet("leaderboard", "--submit", out, "--author", "Bob", "--out", sent)
+    assert (said.code, "has a result of Ann" in said.err) == (2, True)
     text = board_text(sent, "test")
     assert f"Highest mean score of scope {scope_of('wsept')} `wsept` (0.75 [" in text
     (first,) = re.findall(r"\| 1 \|.*", text)
     assert [cell.strip() for cell in first.split("|")][2:4] == ["`wsept`", scope_of("wsept")]
     assert "200 of 200 instances; differences to `wsept` (oracle)." in text
     assert board_text(sent, "validation") == "No results on the split validation."
-    assert run("leaderboard", tmp_path / "absent") == 2
+    assert thermofleet("leaderboard", tmp_path / "absent").code == 2
 
 
 def changed(index: int | None, **fields) -> Callable[[BoardResult], BoardResult]:

@@ -22,7 +22,6 @@ from fleet.arrivals import Arrivals
 from fleet.errors import FleetError, ScenarioError
 from fleet.events import Event
 from fleet.job import Fixture
-from scenarios.cli.main import main
 from scenarios.prepare.fleet import prepare, prepare_arm
 from scenarios.run.shift import run
 from scenarios.show.layout import layout_report
@@ -437,49 +436,37 @@ def test_problems_are_reported_all_at_once_and_drawn_with_the_distance_that_lack
 
 
 @pytest.mark.ci_slow
-def test_the_command_shows_the_cell_and_fails_if_there_are_problems(tmp_path, capsys):
-    def call(*arguments):
-        with pytest.raises(SystemExit) as stop:
-            main(["layout", *map(str, arguments)])
-        said = capsys.readouterr()
-        return stop.value.code, said.out, said.err
-
+def test_the_command_shows_the_cell_and_fails_if_there_are_problems(tmp_path, thermofleet):
     picture = tmp_path / "new" / "cell.png"
-    code, out, _ = call("quickstart", "--out", picture)
+    code, out, _ = thermofleet("layout", "quickstart", "--out", picture)
     assert code == 0
     assert "At most 4 of 4 arms can work at once" in out
     assert "Table(" not in out
     assert picture.read_bytes().startswith(b"\x89PNG")
-    code, _, err = call("quickstart", "--out", picture)
-    assert (code, "exists" in err or "overwrite" in err) == (2, True)
-    code, _, err = call("quickstart", "--out", tmp_path / "cell.jpg")
-    assert (code, "must end in .png" in err) == (2, True)
-    code, out, _ = call("quickstart", "--json")
+    code, _, err = thermofleet("layout", "quickstart", "--out", picture)
+    assert (code, "overwrite" in err) == (2, True)
+    code, out, _ = thermofleet("layout", "quickstart", "--json")
     shown = json.loads(out)
     assert (code, shown["problems"], len(shown["at_once"])) == (0, [], 4)
     text = Path(library()["quickstart"]).read_text(encoding="utf-8").replace('home = "retract"', "")
     file = tmp_path / "near.toml"
     file.write_text(text.replace("[-0.58, -0.42", "[-0.4, -0.42").replace("[0.58, -0.42", "[0.4, -0.42"))
-    code, _, err = call(file)
+    code, _, err = thermofleet("layout", file)
     assert code == 2
     assert "Error: near.toml: arms: at home 'arm_0' (" in err
 
 
-def test_the_layout_of_a_file_with_wrong_jobs_shows_its_cell(small_toml, tmp_path, capsys):
+def test_the_layout_of_a_file_with_wrong_jobs_shows_its_cell(small_toml, tmp_path, thermofleet):
     file, picture = tmp_path / "typo.toml", tmp_path / "cell.png"
     text = small_toml.read_text(encoding="utf-8")
     file.write_text(re.sub(r"^places = \[.*\]$", 'places = ["nowhere"]', text, count=1, flags=re.MULTILINE))
-    with pytest.raises(SystemExit) as stop:
-        main(["layout", str(file), "--out", str(picture)])
-    said = capsys.readouterr()
-    assert (stop.value.code, picture.exists()) == (2, True)
+    said = thermofleet("layout", file, "--out", picture)
+    assert (said.code, picture.exists()) == (2, True)
     (line,) = said.err.split("Error: ")[1:]
     assert "no place 'nowhere'" in line
     assert line.rstrip().endswith("Only arms, places and fixtures are shown, with a hold at each place.")
     file.write_text(re.sub(r"^position_m = .*$", 'position_m = "x"', text, count=1, flags=re.MULTILINE))
-    with pytest.raises(SystemExit):
-        main(["layout", str(file)])
-    assert "position_m: expected a list" in capsys.readouterr().err
+    assert "position_m: expected a list" in thermofleet("layout", file).err
 
 
 def test_stations_side_by_side_are_for_one_arm_at_a_time():

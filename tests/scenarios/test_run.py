@@ -18,7 +18,6 @@ from fleet.events import Event
 from fleet.robot import ThermalLimits
 from fleet.telemetry import Telemetry
 from scenarios.cli.look import last_folder
-from scenarios.cli.main import main
 from scenarios.live.recorder import Recorder
 from scenarios.live.trace import NOT_RECORDED, rows_of, thread_of, thread_table
 from scenarios.prepare.fleet import Fleet, prepare
@@ -286,21 +285,17 @@ def test_every_event_of_a_run_leads_to_what_its_files_hold(folder: Path) -> None
             assert thread.twin == {"arm": event["arm"], **card["twins"][event["arm"]]}
 
 
-def test_the_command_shows_one_screen_or_json(folder: Path, capsys, monkeypatch) -> None:
+def test_the_command_shows_one_screen_or_json(folder: Path, thermofleet, capsys, monkeypatch) -> None:
     monkeypatch.chdir(folder.parent.parent)
     assert last_folder(Path("runs")) == Path("runs/one")
-    for options in ([], ["--json"]):
-        with pytest.raises(SystemExit) as ended:
-            main(["report", "--trace", "finish", *options])
-        assert ended.value.code in (0, None)
-    screen, text = capsys.readouterr().out.split("{", 1)
+    screen, text = (thermofleet("report", "--trace", "finish", *options).out for options in ([], ["--json"]))
     assert len(screen.splitlines()) < 60
     assert all(head in screen for head in ("event", "job", "award", "plan", "offers", "twin", "configuration", "code"))
     thread = thread_of(Path("runs/one"), "finish")
     odd = replace(thread, event=replace(thread.event, reason="[bold]a[/b] of others"))
     out_console.print(thread_table(odd))
     assert "[bold]a[/b] of others" in capsys.readouterr().out
-    shown = json.loads("{" + text)
+    shown = json.loads(text)
     assert (shown["event"]["kind"], shown["award"]["kind"]) == ("finish", "award")
     assert code_hash() in screen
 

@@ -13,7 +13,6 @@ from agents.learned.policy import load_policy
 from agents.learned.ppo import PpoConfig
 from agents.pairs import PAIRS_CARD, PARAMETERS, Prices
 from fleet.errors import FleetError
-from scenarios.cli.main import main
 from scenarios.evaluate.references import load_references
 from scenarios.evaluate.rollout import outcomes
 from scenarios.evaluate.scores import split_file
@@ -97,13 +96,13 @@ def test_what_cannot_be_trained_is_refused(thermofleet, tmp_path, monkeypatch, w
 
 @pytest.fixture(scope="module")
 def ground():
-    scenario = override(load("quickstart"), horizon_s=1200.0)
+    scenario = override(load("quickstart"), horizon_s=600.0)
     return training_instances([Instance("train/9999", scenario, 3)])[0]
 
 
 def test_rewards_of_a_batch_are_those_of_the_rule_it_begins_as(ground) -> None:
     """In the same shift, decision by decision, with perfect messages; and other parameters give another reward."""
-    fleet = prepare(override(load("quickstart"), horizon_s=1200.0), difficulty="oracle")
+    fleet = prepare(override(load("quickstart"), horizon_s=600.0), difficulty="oracle")
     expected = [outcome.reward for outcome in outcomes(fleet, "bid_price", [3, 4])]
     found = rewards(ground, np.zeros((2, PARAMETERS)), [3, 4])
     np.testing.assert_allclose(found, expected, rtol=1e-9)
@@ -241,7 +240,7 @@ def test_time_of_a_session_or_in_total() -> None:
 
 
 @pytest.mark.ci_slow
-def test_an_interrupted_series_is_completed(tmp_path, ground, monkeypatch, capsys) -> None:
+def test_an_interrupted_series_is_completed(tmp_path, ground, monkeypatch, thermofleet) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(pairs, "training_instances", lambda *args, **options: [ground])
     monkeypatch.setattr("scenarios.evaluate.scores.references_of", lambda cases: {})
@@ -249,12 +248,11 @@ def test_an_interrupted_series_is_completed(tmp_path, ground, monkeypatch, capsy
 
     def trained(*more: str) -> tuple[list[int], int]:
         """Iterations of each training, and trainings that were skipped."""
-        with pytest.raises(SystemExit) as stop:
-            main(["train", *words, *more])
-        assert stop.value.code == 0, capsys.readouterr().err
+        said = thermofleet("train", *words, *more)
+        assert said.code == 0, said.err
         folders = sorted((tmp_path / "runs").iterdir())
         rows = [[json.loads(line) for line in (folder / LOG).read_text().splitlines()] for folder in folders]
-        skipped = " ".join(capsys.readouterr().err.split()).count("because it is complete.")
+        skipped = " ".join(said.err.split()).count("because it is complete.")
         return [max(row["iteration"] for row in each if "iteration" in row) for each in rows], skipped
 
     assert trained("--iterations", "1") == ([1], 0)

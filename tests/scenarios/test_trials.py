@@ -4,7 +4,6 @@ import subprocess
 import sys
 from dataclasses import replace
 from io import StringIO
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -27,42 +26,6 @@ from scenarios.processes import Queue
 from scenarios.show.comparison_page import result_text
 from scenarios.spec.parse import override
 from scenarios.spec.schema import Scenario
-from tests.own_policies import IDLE
-
-BAD = (
-    IDLE
-    + """
-class Raises(Idle):
-    def act(self, seen):
-        self.asked += 1
-        return seen["nobody"] if self.asked == 4 else {}
-class Nonsense(Idle):
-    def act(self, seen): return dict.fromkeys(seen, "wait")
-class Stuck(Idle):
-    def act(self, seen):
-        while True:
-            try:
-                while True: pass
-            except Exception: pass
-class Illegal(Idle):
-    def act(self, seen): return dict.fromkeys(seen, 10**30)
-class DiesInOne(Idle):
-    def act(self, seen):
-        if abs(self.drawn - DRAWN) < 1e-12: os._exit(3)
-        return {}
-"""
-)
-
-
-@pytest.fixture
-def bad(tmp_path: Path) -> Path:
-    from scenarios.policy_loader import policy_at
-
-    path = tmp_path / "bad.py"
-    path.write_text(BAD.replace("DRAWN", "0.0"), encoding="utf-8")
-    drawn = policy_at(f"{path}:Idle", 1).drawn  # pyright: ignore[reportAttributeAccessIssue]  # of the file
-    path.write_text(BAD.replace("DRAWN", repr(drawn)), encoding="utf-8")
-    return path
 
 
 def study_of(scenario: Scenario, *policies: str, seeds: int = 3, **more) -> Study:
