@@ -154,7 +154,7 @@ def test_same_input_same_bytes_in_any_order_of_the_log() -> None:
     assert page() == page(copy.deepcopy(RUN), EVENTS[::-1])
 
 
-@pytest.mark.parametrize("count", [1, 5, 16])
+@pytest.mark.parametrize("count", [1, 16])
 def test_every_arm_has_a_row_and_a_lane_of_seven_motors(count: int) -> None:
     arms = tuple(f"arm_{i}" for i in range(count))
     text = page(events=(), arms=arms, readings=telemetry(50, count))

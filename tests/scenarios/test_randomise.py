@@ -47,20 +47,6 @@ def test_a_constant_offset_equals_a_scenario_with_a_warmer_cell(thermofleet, sma
         assert one.reward != without.reward
 
 
-@pytest.mark.ci_slow
-def test_rows_do_not_depend_on_the_number_of_workers(small_toml, plans, monkeypatch):
-    scenario = load(small_toml)
-    study = study_of(scenario)
-    monkeypatch.setattr("scenarios.evaluate.study.TOGETHER", 2)
-    alone = runner.run_study(study, cache_dir=plans, workers=1)
-    monkeypatch.setattr(runner, "HERE_S", 0.0)
-    assert runner.run_study(study, cache_dir=plans, workers=2) == alone
-    fleet = prepare(scenario, difficulty="blind", randomise=VARIED, cache=plans)
-    assert [row.outcome for row in alone[:4]] == outcomes(fleet, "random", range(4))
-    plain = runner.run_study(study_of(scenario, randomise=None), cache_dir=plans, workers=1)
-    assert all(one.outcome != other.outcome for one, other in zip(alone, plain, strict=True))
-
-
 def test_instances_of_one_cell_keep_their_own_jobs_in_variants(small_toml, plans):
     scenario = load(small_toml)
     hold, sort = scenario.jobs

@@ -235,13 +235,6 @@ def test_more_epochs_know_the_record_better(waves):
     assert (known[:, 1] < known[:, 0]).all()
 
 
-@pytest.mark.slow
-def test_workers_do_not_change_the_error_by_epochs(waves):
-    one, two = (report.epoch_study(waves, np.zeros((5, 12, 2, 3)), **SHORT, workers=n) for n in (1, 2))
-    for a, b in zip(one, two, strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 def test_too_few_jobs_are_refused(waves):
     with pytest.raises(ValueError, match="needs 10 cool jobs or more"):
         report.epoch_study(waves, np.zeros((5, 12, 2, 3)), **SHORT | {"records": 5})

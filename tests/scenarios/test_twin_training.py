@@ -59,17 +59,6 @@ def test_a_twin_trained_by_hand_is_that_of_the_fleet(scenario, fleet, plans, tmp
     assert told[-1] == ("training", 1.0)
 
 
-def test_the_twins_of_the_fleet_are_not_trained_again(scenario, fleet, monkeypatch):
-    def never(*_args, **_more):
-        raise AssertionError("trained again")
-
-    monkeypatch.setattr("scenarios.prepare.twins.train_twin", never)
-    kept = train_arms(scenario, [0, 1], TINY)
-    assert [quality(twin) for twin in kept] == [quality(twin) for twin in fleet]
-    with pytest.raises(AssertionError, match="trained again"):
-        train_arms(scenario, [1], replace(TINY, epochs=3))
-
-
 def test_what_is_trained_by_hand_is_kept_by_its_seed_and_that_of_its_exploration(scenario, fleet, monkeypatch):
     (first,) = train_arms(scenario, [1], TINY, seed=6)
     trained = []

@@ -137,9 +137,8 @@ def test_two_shifts_play_in_step(browser: Browser, run: RunLog, tmp_path: Path, 
 
 
 @pytest.mark.ci_slow
-@pytest.mark.parametrize("width", [390, 500])
-def test_a_narrow_page_overprints_nothing(page: Page, width: int) -> None:
-    page.set_viewport_size({"width": width, "height": 850})
+def test_a_narrow_page_overprints_nothing(page: Page) -> None:
+    page.set_viewport_size({"width": 390, "height": 850})
     page.reload()
     page.wait_for_selector("body[data-ready]", timeout=300_000)
     page.wait_for_timeout(500)
