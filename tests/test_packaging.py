@@ -248,7 +248,7 @@ def test_a_missing_extra_is_one_sentence(call, extra):
 
 
 @pytest.mark.ci_slow
-def test_the_demo_needs_no_more_than_its_extra(tmp_path):
+def test_the_demo_sets_two_policies_side_by_side_and_needs_no_more_than_its_extra(tmp_path):
     """Nothing is trained or planned, and no library is imported that `make demo` does not install."""
     own = {name_of(requirement) for requirement in EXTRAS["demo"]}
     program = f"""{without(OPTIONAL - own - {"pandas"})}  # pyarrow asks whether it is there
@@ -261,3 +261,11 @@ main()
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout.splitlines()[1].split() == ["round_robin", "wsept", "difference"]
     assert "Training" not in ran.stderr
+    page = (tmp_path / "demo" / "index.html").read_text(encoding="utf-8")
+    links = re.findall(r'href="([^"]+)"', page)
+    assert [link for link in links if not (tmp_path / "demo" / link).is_file()] == []
+    assert page.count('class="cell"') == page.count('<section id="run-') == len(links) == 2
+    for policy in ("round_robin", "wsept"):
+        card = json.loads((tmp_path / "demo" / policy / "run.json").read_text(encoding="utf-8"))
+        assert (card["policy"], card["status"]) == (policy, "finished")
+        assert f"{card['metrics']['above_warning_min']:.1f}" in ran.stdout

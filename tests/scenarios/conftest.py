@@ -99,6 +99,10 @@ class CommandResult(NamedTuple):
     out: str
     err: str
 
+    def refused(self, sentence: str) -> bool:
+        """Whether the command ended with exit code 2 and this sentence, which may be wrapped."""
+        return self.code == 2 and sentence in " ".join(self.err.split())
+
 
 @pytest.fixture(scope="session")
 def subject() -> SimpleNamespace:

@@ -232,7 +232,7 @@ def test_finished_rows_are_kept_and_a_larger_budget_searches_again(
 @pytest.mark.ci_slow
 def test_a_budget_of_evaluations_gives_the_same_file_in_any_order(fleet: Fleet, tmp_path: Path):
     tasks = [Instance(f"three/{seed}", fleet.scenario, seed) for seed in (2, 10)]
-    budget, plans = Budget(seconds=np.inf, evaluations=64, nodes=5), tmp_path / "plans"
+    budget, plans = Budget(seconds=np.inf, evaluations=16, nodes=2), tmp_path / "plans"
     once = references(tasks, tmp_path / "once.jsonl", budget, difficulty="blind", cache=plans)
     for task in reversed(tasks):  # as of a run that was stopped
         references([task], tmp_path / "twice.jsonl", budget, difficulty="blind", cache=plans)

@@ -481,9 +481,7 @@ def test_a_comparison_of_sources_resumes(thermofleet, small_toml, tmp_path, monk
 
 def test_bad_sources_are_named(thermofleet, small_toml) -> None:
     for words in (("--difficulty", "trained,oracel"), ("--policies", "wspt@oracel")):
-        said = thermofleet("compare", small_toml, *words)
-        assert said.code == 2
-        assert "No difficulty 'oracel'; did you mean 'oracle'?" in said.err
-    said = thermofleet("compare", small_toml, "--policies", "wspt,wspt@blind", "--difficulty", "blind")
-    assert said.code == 2
-    assert "The policy 'wspt@blind' is given twice" in said.err
+        assert thermofleet("compare", small_toml, *words).refused("No difficulty 'oracel'; did you mean 'oracle'?")
+    assert thermofleet("compare", small_toml, "--policies", "wspt,wspt@blind", "--difficulty", "blind").refused(
+        "The policy 'wspt@blind' is given twice"
+    )

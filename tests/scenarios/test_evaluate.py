@@ -36,9 +36,8 @@ from scenarios.spec.schema import Ambient, RewardSpec
 from scenarios.suite.splits import manifest
 from tests.scenarios.conftest import Known
 
-SEEDS = (0, 3, 12)
+SEEDS = (0, 3)
 LATE = Channel(delay_s=25.0, loss=0.3)
-LIBRARY = sorted(path.stem for path in (Path(__file__).parents[2] / "scenarios" / "library").glob("*.toml"))
 
 
 class Restless:
@@ -128,14 +127,6 @@ def test_no_figure_of_these_shifts_is_trivial(hot, in_turn) -> None:
     worked = run(in_turn, RunSpec(policy="random", seed=SEEDS[0], bus="memory"), record=False)
     assert worked.finished
     assert worked.time_s < in_turn.scenario.horizon_s  # all jobs are done
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", LIBRARY)
-def test_the_same_holds_for_every_scenario_of_the_library(name) -> None:
-    fleet = prepare(load(name), difficulty="oracle")
-    for policy in RULES:
-        check_equal(outcomes(fleet, policy, SEEDS), one_by_one(fleet, policy, SEEDS))
 
 
 @pytest.mark.parametrize("channel", [PERFECT, LATE], ids=["perfect", "late"])

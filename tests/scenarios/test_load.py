@@ -312,9 +312,9 @@ def test_a_trace_in_minutes_or_partly_in_milliseconds_is_asked_about(tmp_path, c
 def test_a_run_without_a_job_ends_with_the_reason(thermofleet, small_toml, tmp_path):
     text = small_toml.read_text(encoding="utf-8").replace("every_s = 30", "every_s = 1e6")
     small_toml.write_text(text.replace("count = 2", "count = 2, start_s = 200"), encoding="utf-8")
-    said = thermofleet("run", small_toml, "--out", tmp_path / "run")
-    assert said.code == 2
-    assert "Error: heat, seed 0: no job arrives in this shift of 180 s. Expected numbers: 'hold' 0, 'sort'" in said.err
+    assert thermofleet("run", small_toml, "--out", tmp_path / "run").refused(
+        "Error: heat, seed 0: no job arrives in this shift of 180 s. Expected numbers: 'hold' 0, 'sort'"
+    )
     assert not (tmp_path / "run").exists()
 
 
@@ -443,17 +443,14 @@ def test_the_command_shows_the_cell_and_fails_if_there_are_problems(tmp_path, th
     assert "At most 4 of 4 arms can work at once" in out
     assert "Table(" not in out
     assert picture.read_bytes().startswith(b"\x89PNG")
-    code, _, err = thermofleet("layout", "quickstart", "--out", picture)
-    assert (code, "overwrite" in err) == (2, True)
+    assert thermofleet("layout", "quickstart", "--out", picture).refused("overwrite")
     code, out, _ = thermofleet("layout", "quickstart", "--json")
     shown = json.loads(out)
     assert (code, shown["problems"], len(shown["at_once"])) == (0, [], 4)
     text = Path(library()["quickstart"]).read_text(encoding="utf-8").replace('home = "retract"', "")
     file = tmp_path / "near.toml"
     file.write_text(text.replace("[-0.58, -0.42", "[-0.4, -0.42").replace("[0.58, -0.42", "[0.4, -0.42"))
-    code, _, err = thermofleet("layout", file)
-    assert code == 2
-    assert "Error: near.toml: arms: at home 'arm_0' (" in err
+    assert thermofleet("layout", file).refused("Error: near.toml: arms: at home 'arm_0' (")
 
 
 def test_the_layout_of_a_file_with_wrong_jobs_shows_its_cell(small_toml, tmp_path, thermofleet):

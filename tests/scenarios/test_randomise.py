@@ -73,9 +73,7 @@ def test_results_say_how_they_were_randomised(thermofleet, small_toml, tmp_path)
     same = thermofleet(*how, "--randomise", "arrivals=[1.0, 1.5]\nambient_k=[-2.0, 8.0]", "--json")  # of a file, say
     assert json.loads(same.out)["randomise"] == expected
     for other in ((), ambient):
-        said = thermofleet(*how, *other)
-        assert said.code == 2
-        assert "holds a study with randomise" in said.err
+        assert thermofleet(*how, *other).refused("holds a study with randomise")
 
 
 @pytest.mark.parametrize(
@@ -119,9 +117,7 @@ def test_commands_refuse_what_cannot_be_randomised(thermofleet, small_toml, tmp_
         (("train", small_toml, "--randomise", "x=1"), "--randomise has no field 'x'"),
         (("train", "--suite", "train", "--randomise", "ambient_k=[0,1]"), "the instances of --suite are fixed"),
     ):
-        said = thermofleet(*words)
-        assert said.code == 2
-        assert message in " ".join(said.err.split())
+        assert thermofleet(*words).refused(message)
     scenario = override(load(small_toml), ambient={"points": [[0, 55]]})
     with pytest.raises(ScenarioError, match="goes too far"):
         study_of(scenario)
@@ -142,6 +138,4 @@ def test_a_training_is_randomised_and_says_so(thermofleet, small_toml, tmp_path)
         assert [card["randomise"] for card in cards] == [expected, expected]
     assert best["hot"] < best["plain"]
     for name, more in (("hot", ()), ("plain", ("--randomise", "arrivals=[1,2]"))):
-        said = thermofleet(*how, "--out", tmp_path / name, "--resume", *more)
-        assert said.code == 2
-        assert "has randomise = " in said.err
+        assert thermofleet(*how, "--out", tmp_path / name, "--resume", *more).refused("has randomise = ")

@@ -31,7 +31,6 @@ from scenarios.suite.instances import (
 from scenarios.suite.splits import cell_of_instance, instance, manifest, split
 
 PLAIN = Axes(heat="warm", arrivals="poisson", due="usual", faults="attended", bus="perfect")
-SMALL = [cell for cell in CELLS if cell.arms <= 8]
 
 
 def cell_named(name: str) -> SuiteCell:
@@ -138,16 +137,6 @@ def test_an_instance_is_loaded_by_name() -> None:
         load("test/9999")
     with pytest.raises(ScenarioError, match="split"):
         split("exam")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("cell", SMALL, ids=lambda cell: cell.name)
-def test_all_arms_of_a_cell_can_work_at_once(cell) -> None:
-    from scenarios.show.layout import layout_report
-
-    report = layout_report(scenario_of("x", cell, replace(PLAIN, heat="cool"), 0))
-    assert report.problems == ()
-    assert len(report.at_once) == cell.arms
 
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results" / "leaderboard"
