@@ -28,19 +28,6 @@ def test_a_true_probability_has_little_error_and_a_boast_has_much() -> None:
     assert calibration_error(share, event) == pytest.approx(expected, abs=0.012)
 
 
-@pytest.mark.parametrize(
-    ("p", "event", "says"),
-    [
-        (np.zeros(0), np.zeros(0, bool), "at least one"),
-        (np.array([1.2]), np.array([True]), r"\[0, 1\]"),
-        (np.array([np.nan]), np.array([True]), r"\[0, 1\]"),
-    ],
-)
-def test_invalid_probabilities_are_refused(p, event, says) -> None:
-    with pytest.raises(ValueError, match=says):
-        calibration_error(p, event)
-
-
 @pytest.mark.slow
 def test_true_p_agrees_with_the_outcomes_of_a_shift() -> None:
     """With the true state P is exact but for the noise of the sensors."""

@@ -196,19 +196,6 @@ def test_measures_by_hand():
     assert found["spearman"] == pytest.approx(0.8)
 
 
-@pytest.mark.parametrize(
-    ("score", "peak_c", "says"),
-    [
-        (np.arange(4.0), np.full(4, 80.0), "some of both kinds"),
-        (np.array([0.0, np.nan]), np.array([30.0, 70.0]), "finite"),
-        (np.arange(3.0), np.array([30.0, 70.0]), "alike"),
-    ],
-)
-def test_invalid_scores_are_refused(score, peak_c, says):
-    with pytest.raises((FleetError, ValueError), match=says):
-        detection(score, peak_c, limit_c=60.0)
-
-
 def test_jobs_fill_the_horizon(study):
     for plan, times in zip(study.test.plans, study.test.repetitions, strict=True):
         assert times * plan.cycle.duration_s >= study.horizon_s
