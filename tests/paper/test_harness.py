@@ -9,12 +9,7 @@ import pytest
 
 from benchmarks.paper import harness, sweep
 from benchmarks.paper.harness import Experiment, Unit, compute, mean_by_group, one_row, seeded, table_of, wholes
-from benchmarks.paper.sweep import (
-    OURS,
-    SWEEP,
-    sweep_tables,
-    train_regressor,
-)
+from benchmarks.paper.sweep import OURS, SWEEP, sweep_tables, train_regressor
 from fleet.errors import FleetError
 from scenarios.evaluate.statistics import interval
 from scenarios.json_rows import Rows
@@ -140,11 +135,7 @@ def test_differences_are_paired_by_arm():
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (("--only", "beta"), "No configuration 'beta'"),
-        (("--arms", "0,4"), "--arms must be 0 to 3"),
-    ],
+    ("words", "says"), [(("--only", "beta"), "No configuration 'beta'"), (("--arms", "0,4"), "--arms must be 0 to 3")]
 )
 def test_options_are_checked(words, says, tmp_path):
     with pytest.raises(FleetError, match=says):

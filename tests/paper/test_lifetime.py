@@ -217,11 +217,7 @@ def test_moments_by_hand():
 def test_inputs_follow_their_jobs(study, twin):
     jobs = study.test
     order = np.random.default_rng(0).permutation(len(jobs.plans))
-    moved = replace(
-        jobs,
-        plans=tuple(jobs.plans[i] for i in order),
-        peak_c=jobs.peak_c[order],
-    )
+    moved = replace(jobs, plans=tuple(jobs.plans[i] for i in order), peak_c=jobs.peak_c[order])
     first, again = job_inputs(twin, jobs), job_inputs(twin, moved)
     assert first["latent"].shape == (24, 7 * 2 * 2)
     assert first["raw"].shape == (24, 7 * 9 * 2)

@@ -5,15 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.paper.real_logs import (
-    AHEAD_S,
-    MOTION,
-    QUESTIONS,
-    Windows,
-    answers,
-    judged_windows,
-    peak_within,
-)
+from benchmarks.paper.real_logs import AHEAD_S, MOTION, QUESTIONS, Windows, answers, judged_windows, peak_within
 from benchmarks.paper.subjects import Study, make_study
 from fleet.errors import FleetError
 from fleet.heat.thermal import WINDING

@@ -381,11 +381,7 @@ def test_a_wrong_head_is_told(tmp_path, head, sentence):
 def test_a_file_that_is_no_table_is_told(tmp_path):
     for name, content, sentence in (
         ("jobs.parquet", b"PAR1", "'jobs.parquet' is not a Parquet file ("),
-        (
-            "jobs.xls",
-            b"\xd0\xcf\x11\xe0\x00",
-            "'jobs.xls' is a workbook or an archive. Save its sheet as CSV",
-        ),
+        ("jobs.xls", b"\xd0\xcf\x11\xe0\x00", "'jobs.xls' is a workbook or an archive. Save its sheet as CSV"),
         ("jobs.csv", b"\x00\x01", "'jobs.csv' is not a text file in UTF-8: it has NUL bytes. Save it as UTF-8."),
         ("none.csv", None, "'none.csv': there is no file '"),
     ):

@@ -11,15 +11,7 @@ from scipy.stats import spearmanr
 
 from fleet.arm.model import ArmModel
 from fleet.heat.motor import gen3_motors, reference_current
-from fleet.heat.thermal import (
-    HOUSING,
-    WINDING,
-    advance,
-    drive_heat,
-    gen3_network,
-    simulate_temperatures,
-    thermal_model,
-)
+from fleet.heat.thermal import HOUSING, WINDING, advance, drive_heat, gen3_network, simulate_temperatures, thermal_model
 from fleet.job import Fixture
 from fleet.motion import static_drive
 from fleet.robot import Robot
