@@ -103,6 +103,11 @@ class CommandResult(NamedTuple):
         """Whether the command ended with exit code 2 and this sentence, which may be wrapped."""
         return self.code == 2 and sentence in " ".join(self.err.split())
 
+    def succeeded(self) -> "CommandResult":
+        """This result, of a command that must have ended with exit code 0."""
+        assert self.code == 0, self.err
+        return self
+
 
 @pytest.fixture(scope="session")
 def subject() -> SimpleNamespace:

@@ -37,8 +37,7 @@ from twin.thermal.identify import AMBIENT_C
 
 def test_a_run_prints_its_figures_and_leaves_four_files(thermofleet, small_toml, tmp_path):
     out = tmp_path / "run"
-    said = thermofleet("run", small_toml, *QUICK, "--out", out)
-    assert said.code == 0
+    said = thermofleet("run", small_toml, *QUICK, "--out", out).succeeded()
     assert sorted(p.name for p in out.iterdir()) == sorted(FILES)
     printed = run_json(out)
     assert printed["status"] == "finished"
@@ -57,9 +56,9 @@ def test_a_run_prints_its_figures_and_leaves_four_files(thermofleet, small_toml,
 def test_the_same_seed_gives_the_same_files_also_in_another_process(thermofleet, small_toml, tmp_path, plant):
     one, two = tmp_path / "one", tmp_path / "two"
     command = ("run", small_toml, *QUICK, "--plant", plant, "--seed", 3)
-    assert thermofleet(*command, "--out", one).code == 0
+    thermofleet(*command, "--out", one).succeeded()
     if plant == "mujoco":
-        assert thermofleet(*command, "--out", two).code == 0
+        thermofleet(*command, "--out", two).succeeded()
     else:
         words = [*REAL, *map(str, command), "--out", str(two)]
         subprocess.run(words, check=True, env=os.environ | {"PYTHONHASHSEED": "7"}, capture_output=True, timeout=300)
@@ -79,13 +78,12 @@ def test_json_is_one_object_of_a_run_which_goes_into_runs_and_is_kept_without_ov
     changed.write_bytes(b"")
     assert thermofleet(*command).code == 2
     assert changed.read_bytes() == b""
-    assert thermofleet(*command, "--overwrite").code == 0
+    thermofleet(*command, "--overwrite").succeeded()
     assert changed.read_bytes() != b""
 
 
 def test_show_lists_the_library_the_cells_and_the_instances_of_a_split(thermofleet):
-    said = thermofleet("show")
-    assert said.code == 0
+    said = thermofleet("show").succeeded()
     assert all(name in said.out for name in library())
     assert set(json.loads(thermofleet("show", "--json").out)) == set(library())
     names = [row["name"] for row in json.loads(thermofleet("show", "--suite", "test", "--json").out)]
@@ -97,8 +95,7 @@ def test_show_lists_the_library_the_cells_and_the_instances_of_a_split(thermofle
 
 def test_show_fits_eighty_columns_and_cuts_no_word(thermofleet, small_toml):
     small_toml.write_text(small_toml.read_text().replace('kind = "hold"', 'kind = "hold"\ndue = "hard"\ndue_s = 150'))
-    said = thermofleet("show", small_toml)
-    assert said.code == 0
+    said = thermofleet("show", small_toml).succeeded()
     assert max(len(line.rstrip()) for line in said.out.splitlines()) <= 80
     assert "…" not in said.out
     assert "hold 2 kg at bench, 1–2 × 10 s" in said.out
@@ -241,8 +238,7 @@ def test_a_name_of_another_form_is_refused(thermofleet, words, name):
 
 def test_help_names_every_command_by_group_and_run_names_every_policy_and_topology(thermofleet):
     assert thermofleet("--version").out == f"thermofleet {version('thermofleet')}\n"
-    said = thermofleet("--help")
-    assert said.code == 0
+    said = thermofleet("--help").succeeded()
     assert all(f"│ {name.split()[0]} " in said.out for name in COMMANDS)
     assert all(f"─ {entry.panel} ─" in said.out for entry in COMMANDS.values())
     wide = " ".join(thermofleet("run", "--help").out.replace("│", " ").split())
@@ -251,8 +247,7 @@ def test_help_names_every_command_by_group_and_run_names_every_policy_and_topolo
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_listed_command_can_be_imported_and_explains_itself(thermofleet, name):
-    said = thermofleet(*name.split(), "--help")
-    assert said.code == 0
+    said = thermofleet(*name.split(), "--help").succeeded()
     assert f"Usage: thermofleet {name}" in said.out
 
 
@@ -420,7 +415,7 @@ def test_a_run_records_its_channel_and_is_the_same_over_either_bus(thermofleet, 
     printed = {}
     for bus in ("memory", "zenoh"):
         out = tmp_path / bus
-        assert thermofleet("run", small_toml, *BLIND, *HARD, "--bus", bus, "--out", out).code == 0
+        thermofleet("run", small_toml, *BLIND, *HARD, "--bus", bus, "--out", out).succeeded()
         printed[bus] = json.loads((out / "run.json").read_text(encoding="utf-8"))
     assert printed["memory"]["channel"] == {
         "topology": "line",
@@ -460,8 +455,8 @@ def test_a_new_scenario_runs_and_its_comments_are_allowed_choices(thermofleet, t
     file, out = tmp_path / "my_cell.toml", tmp_path / "run"
     said = thermofleet("new", file)
     assert (said.code, f"thermofleet layout {file}" in said.out) == (0, True)
-    assert thermofleet("layout", file).code == 0
-    assert thermofleet("run", file, *QUICK, "--out", out).code == 0
+    thermofleet("layout", file).succeeded()
+    thermofleet("run", file, *QUICK, "--out", out).succeeded()
     metrics = run_json(out)["metrics"]
     assert 5 < metrics["finished"] == metrics["jobs"]
     text = file.read_text(encoding="utf-8")
@@ -475,7 +470,7 @@ def test_a_new_scenario_runs_and_its_comments_are_allowed_choices(thermofleet, t
 
 def test_a_new_scenario_may_be_a_copy_and_replaces_no_file(thermofleet, tmp_path):
     file = tmp_path / "mine.toml"
-    assert thermofleet("new", file, "--from", "quickstart").code == 0
+    thermofleet("new", file, "--from", "quickstart").succeeded()
     assert file.read_bytes() == library()["quickstart"].read_bytes()
     for words, reason in (
         ((file,), f"'{file}' exists. Give another name, or remove it."),

@@ -445,8 +445,7 @@ def test_sources_have_the_rewards_that_they_always_had(thermofleet, small_toml, 
     """Equal up to the rounding of energies in float32."""
     small_toml.write_text(small_toml.read_text() + twin)
     how = ("--fleets", 2, "--trainings", 2, "--seeds", 2, "--first-seed", 10_000, "--out", tmp_path / "out")
-    done = thermofleet("compare", small_toml, "--policies", ",".join(expected), *how)
-    assert done.code == 0, done.err
+    thermofleet("compare", small_toml, "--policies", ",".join(expected), *how).succeeded()
     found: dict[str, list[float]] = {}
     for row in read_rows(tmp_path / "out"):
         assert row.outcome is not None
@@ -462,8 +461,7 @@ def test_a_comparison_of_sources_resumes(thermofleet, small_toml, tmp_path, monk
     how = ("--fleets", 2, "--trainings", 2, "--first-seed", 10_000, "--workers", 1)
     names = ("--policies", "wspt,round_robin@blind", "--difficulty", "blind,rc-nominal,random,oracle")
     call = ("compare", small_toml, *names, *how, "--out", out)
-    done = thermofleet(*call, "--seeds", 2)
-    assert done.code == 0, done.err
+    done = thermofleet(*call, "--seeds", 2).succeeded()
     for name in ("wspt@blind", "wspt@rc-nominal", "wspt@random", "wspt@oracle", "round_robin@blind"):
         assert done.out.count(f"  {name} ") == 1 + len(FIGURES)  # its scope, and each figure
     assert len(read_rows(out)) == 2 * 2 * (1 + 1 + 2 + 1 + 1)  # random numbers have two trainings
@@ -475,7 +473,7 @@ def test_a_comparison_of_sources_resumes(thermofleet, small_toml, tmp_path, monk
 
     units, real = [], runner.run_unit
     monkeypatch.setattr(runner, "run_unit", lambda unit, settings: units.append(unit) or real(unit, settings))
-    assert thermofleet(*call, "--seeds", 3).code == 0
+    thermofleet(*call, "--seeds", 3).succeeded()
     assert [unit.case.seeds for unit in units] == [(10_002,)] * 12
 
 

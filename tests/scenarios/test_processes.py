@@ -140,7 +140,7 @@ def test_ctrl_c_while_working_keeps_what_was_done_and_the_same_command_replaces_
     assert sorted(p.name for p in out.iterdir()) == sorted(FILES)
     assert run_json(out)["status"] == "interrupted"
     assert run_json(out)["time_s"] == 40.0
-    assert thermofleet("run", small_toml, *QUICK, "--out", out).code == 0
+    thermofleet("run", small_toml, *QUICK, "--out", out).succeeded()
     assert run_json(out)["status"] == "finished"
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
 

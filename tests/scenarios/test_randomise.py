@@ -35,7 +35,7 @@ def test_a_constant_offset_equals_a_scenario_with_a_warmer_cell(thermofleet, sma
         ("warm", warm, ()),
         ("cool", small_toml, ()),
     ):
-        assert thermofleet("compare", file, *BLIND, "--out", tmp_path / name, *more).code == 0
+        thermofleet("compare", file, *BLIND, "--out", tmp_path / name, *more).succeeded()
     offset, warm, cool = ([row.outcome for row in read_rows(tmp_path / name)] for name in ("offset", "warm", "cool"))
     for one, other, without in zip(offset, warm, cool, strict=True):
         assert one is not None
@@ -60,8 +60,7 @@ def test_instances_of_one_cell_keep_their_own_jobs_in_variants(small_toml, plans
 def test_results_say_how_they_were_randomised(thermofleet, small_toml, tmp_path):
     how = ("compare", small_toml, *BLIND, "--out", tmp_path / "out")
     ambient, arrivals = ("--randomise", "ambient_k=[-2, 8]"), ("--randomise", "arrivals=[1,1.5]")
-    said = thermofleet(*how, *ambient, *arrivals)
-    assert said.code == 0
+    said = thermofleet(*how, *ambient, *arrivals).succeeded()
     text = "Randomisation: ambient temperature -2 to +8 K, arrival rate times 1 to 1.5."
     assert text in said.out.replace("\n", "")
     assert "references are of shifts without randomisation" in said.out
@@ -128,8 +127,7 @@ def test_a_training_is_randomised_and_says_so(thermofleet, small_toml, tmp_path)
     how = ("train", small_toml, "--difficulty", "blind", "--envs", 2, "--iterations", 1)
     best = {}
     for name, more in (("hot", ("--randomise", "ambient_k=[20, 35]")), ("plain", ())):
-        said = thermofleet(*how, "--out", tmp_path / name, *more)
-        assert said.code == 0
+        said = thermofleet(*how, "--out", tmp_path / name, *more).succeeded()
         assert re.search(r"Saved: iteration (0 \(an untrained network\)|1),", said.out)
         first = json.loads((tmp_path / name / "progress.jsonl").read_text().splitlines()[0])
         best[name] = first["validation"]  # of the same network

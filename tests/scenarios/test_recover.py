@@ -105,8 +105,7 @@ def test_the_documented_command_recovers_an_arm(thermofleet, small_toml, subject
     save(replace(subject.twin, arm="left"), tmp_path / "left.twin")
     out = tmp_path / "recovery"
     recover_left = ("twin", "recover", small_toml, "--twins", tmp_path / "left.twin", "--payload", 3)
-    said = thermofleet(*recover_left, "--posture", "raised", "--out", out)
-    assert said.code == 0, said.err
+    said = thermofleet(*recover_left, "--posture", "raised", "--out", out).succeeded()
     assert "in 600 s; without the new posture to" in said.out
     assert json.loads((out / "recovery.json").read_text(encoding="utf-8"))["payload_kg"] == 3.0
     for option, value, sentence in (
@@ -129,8 +128,7 @@ def test_an_arm_of_logs_needs_no_scenario(thermofleet, subject, tmp_path):
     save_network(network, tmp_path / "rc")
     known = ("--twins", tmp_path / "arm.twin", "--network", tmp_path / "rc", "--tool", 0.5)
     out = tmp_path / "recovery"
-    said = thermofleet("twin", "recover", *known, "--payload", 3, "--posture", "raised", "--out", out)
-    assert said.code == 0, said.err
+    thermofleet("twin", "recover", *known, "--payload", 3, "--posture", "raised", "--out", out).succeeded()
     robot = Robot(name="arm", tool_kg=0.5)
     q = parse_posture("raised")
     start_c = hold_until(bare_arm(robot, gen3_motors(), Verification.nominal(robot, 25.0).thermal), q, 3.0,
@@ -139,8 +137,7 @@ def test_an_arm_of_logs_needs_no_scenario(thermofleet, subject, tmp_path):
     assert card["start_c"] == pytest.approx(start_c[:7].max(), abs=1.0)  # it cools on the way there
     out = tmp_path / "generated"
     stops = ("--posture", "0,20,180,-90,0,-20,90", "--posture", "20,30,180,-60,0,-30,90")
-    said = thermofleet("twin", "generate", *known, *stops, "--count", 2, "--s", 0, "--out", out)
-    assert said.code == 0, said.err
+    thermofleet("twin", "generate", *known, *stops, "--count", 2, "--s", 0, "--out", out).succeeded()
     assert json.loads((out / "generated.json").read_text(encoding="utf-8"))["handed_out"] == 2
     for wrong, sentence in (
         (known[2:], "Give a SCENARIO, or --twins and --network of an arm that is known by its logs"),

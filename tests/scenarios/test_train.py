@@ -248,8 +248,7 @@ def test_an_interrupted_series_is_completed(tmp_path, ground, monkeypatch, therm
 
     def trained(*more: str) -> tuple[list[int], int]:
         """Iterations of each training, and trainings that were skipped."""
-        said = thermofleet("train", *words, *more)
-        assert said.code == 0, said.err
+        said = thermofleet("train", *words, *more).succeeded()
         folders = sorted((tmp_path / "runs").iterdir())
         rows = [[json.loads(line) for line in (folder / LOG).read_text().splitlines()] for folder in folders]
         skipped = " ".join(said.err.split()).count("because it is complete.")

@@ -294,8 +294,7 @@ def test_a_worker_stays_with_its_group_and_helps_others_at_the_end(scenario):
 def test_the_command_tells_every_scenario_and_goes_on_in_its_folder(thermofleet, small_toml, bad, tmp_path):
     out = tmp_path / "study"
     how = ("--difficulty", "blind", "--seeds", "2", "--workers", "1", "--out", out)
-    said = thermofleet("compare", small_toml, "--policies", f"round_robin,{bad}:Raises,{bad}:Illegal", *how)
-    assert said.code == 0
+    said = thermofleet("compare", small_toml, "--policies", f"round_robin,{bad}:Raises,{bad}:Illegal", *how).succeeded()
     told = " ".join(said.out.split())
     assert "Raises failed in 2 shifts, first in" in told
     assert "KeyError: 'nobody' (at 30 s of the shift)" in told

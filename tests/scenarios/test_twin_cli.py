@@ -65,8 +65,7 @@ def test_a_log_becomes_a_twin_that_finds_threefold_torque_harder(thermofleet, tw
     assert card["status"] == "finished"
     mean_d, mean_load = {}, {}
     for name in ("cool/monday.csv", "hot.csv"):
-        said = thermofleet("twin", "score", twins, "--log", logs / name, "--format", "csv")
-        assert said.code == 0
+        said = thermofleet("twin", "score", twins, "--log", logs / name, "--format", "csv").succeeded()
         rows = list(csv.DictReader(io.StringIO(said.out)))
         assert len(rows) == int((400 if "cool" in name else 100) * RATE_HZ) // 50
         assert {row["twin"] for row in rows} == {card["twins"][0]["version"]}
@@ -107,15 +106,14 @@ def test_a_finished_training_is_kept_until_told_otherwise(thermofleet, logs, twi
     again = ("twin", "train", "--log", logs / "cool", *TINY, "--out", twins, "--seed", 1)
     assert thermofleet(*again).code == 2
     assert (twins / "twins.json").read_bytes() == before
-    assert thermofleet(*again, "--overwrite").code == 0
+    thermofleet(*again, "--overwrite").succeeded()
     assert (twins / "twins.json").read_bytes() != before
 
 
 @pytest.mark.ci_slow
 def test_the_twin_of_one_arm_of_a_scenario_scores_its_jobs(thermofleet, small_toml, tmp_path):
     out = tmp_path / "twins"
-    said = thermofleet("twin", "train", small_toml, "--arm", "right", *TINY, "--out", out)
-    assert said.code == 0
+    thermofleet("twin", "train", small_toml, "--arm", "right", *TINY, "--out", out).succeeded()
     assert [home.name for home in out.glob("*.twin")] == ["right.twin"]
     said = thermofleet("twin", "score", out, small_toml, "--json")
     rows = json.loads(said.out)["rows"]
@@ -170,8 +168,7 @@ def test_a_damaged_log_can_be_read_without_its_bad_lines(thermofleet, twins, tmp
     damaged.write_text("\n".join([*lines[:2], "1,2,oops", *lines[3:]]) + "\n", encoding="utf-8")
     refused = thermofleet("twin", "score", twins, "--log", damaged, "--format", "csv")
     assert "--skip-damaged" in refused.err
-    said = thermofleet("twin", "score", twins, "--log", damaged, "--format", "csv", "--skip-damaged")
-    assert said.code == 0
+    said = thermofleet("twin", "score", twins, "--log", damaged, "--format", "csv", "--skip-damaged").succeeded()
     assert len(said.out.splitlines()) == 1 + 2  # the head and two windows of 25 s
 
 
@@ -186,7 +183,7 @@ def test_a_log_that_teaches_nothing_is_told_with_the_options_that_mend_it(thermo
     ):
         assert thermofleet(*words, "--out", tmp_path / "twins").refused(sentence)
         assert not (tmp_path / "twins").exists()
-    assert thermofleet(*short, "--window", 20).code == 0
+    thermofleet(*short, "--window", 20).succeeded()
 
 
 def test_an_exported_twin_ends_in_onnx(thermofleet, twins, tmp_path):
@@ -197,14 +194,13 @@ def test_an_exported_twin_ends_in_onnx(thermofleet, twins, tmp_path):
     assert version in thermofleet("twin", "export", twins, "--out", out).out
     assert version.encode() in out.read_bytes()
     assert thermofleet("twin", "export", twins, "--out", out).refused("twin.onnx' exists; give another --out")
-    assert thermofleet("twin", "export", twins, "--out", out, "--overwrite").code == 0
+    thermofleet("twin", "export", twins, "--out", out, "--overwrite").succeeded()
 
 
 def test_an_identified_arm_is_told_whole_with_its_air_and_its_place_and_is_not_replaced(thermofleet, tmp_path):
     (tmp_path / "monday.csv").write_text(log_csv(400, celsius=31.0, warms_k=5.0), encoding="utf-8")
     identify = ("twin", "identify", "--log", tmp_path / "monday.csv", "--out", tmp_path / "rc")
-    said = thermofleet(*identify)
-    assert said.code == 0
+    said = thermofleet(*identify).succeeded()
     assert "…" not in said.out  # also the longest name fits into 80 columns
     assert "winding_housing_k_per_w" in said.out
     assert (
@@ -235,8 +231,7 @@ def test_a_forecast_follows_from_a_log_and_a_plan(thermofleet, small_toml, tmp_p
     log, plan, page = tmp_path / "today.csv", tmp_path / "plan.csv", tmp_path / "forecast.html"
     log.write_text(log_csv(300, celsius=35.0), encoding="utf-8")
     plan.write_text(log_csv(40, celsius=30.0, seed=1), encoding="utf-8")
-    said = thermofleet("twin", "forecast", "--log", log, "--plan", plan, "--repeat", 15, "--out", page)
-    assert said.code == 0
+    said = thermofleet("twin", "forecast", "--log", log, "--plan", plan, "--repeat", 15, "--out", page).succeeded()
     assert re.search(r"After 15 repetitions, 9 min 52 s, joint \d is the hottest: [\d.]+ °C \(95 % interval", said.out)
     assert re.search(r"^60 °C +< 0\.005 ", said.out, re.MULTILINE)
     assert 'id="forecast_chart"' in page.read_text(encoding="utf-8")
@@ -278,11 +273,11 @@ def test_one_arm_of_a_log_of_several_is_chosen_by_its_name(thermofleet, tmp_path
     pq.write_table(pa.table(both).filter(pc.field("arm") == "right"), alone)
     cards = {}
     for log, arm in ((path, ("--arm", "right")), (alone, ())):
-        said = thermofleet("twin", "train", "--log", log, *arm, *TINY, "--out", log.parent / "twins", "--json")
-        assert said.code == 0, said.err
+        said = thermofleet(
+            "twin", "train", "--log", log, *arm, *TINY, "--out", log.parent / "twins", "--json"
+        ).succeeded()
         (twin,) = json.loads(said.out)["twins"]
-        identified = thermofleet("twin", "identify", "--log", log, *arm, "--json")
-        assert identified.code == 0, identified.err
+        identified = thermofleet("twin", "identify", "--log", log, *arm, "--json").succeeded()
         network = json.loads(identified.out)
         cards[log] = twin["arm"], twin["data_hash"], network["arm"], network["data_hash"]
     assert cards[path] == cards[alone]
