@@ -262,6 +262,9 @@ def test_a_shift_with_breaks_and_failures_is_the_same_in_a_batch_and_alone(scena
     kinds = {event.kind for event in done.events}
     assert {"break", "break_end", "failure", "recover"} <= kinds
     assert not any(300.0 <= event.time_s < 600.0 for event in done.events if event.kind == "award")
+    drawn = absences_of(scenario, np.random.SeedSequence(3))
+    broken_s = {10.0 * begin for begin in drawn["begin"][drawn["kind"] == BROKEN].tolist()}
+    assert {event.time_s for event in done.events if event.kind == "failure"} <= broken_s
     page = report_html(done)
     assert "failed, not by heat" in page
     assert "has a break" in page

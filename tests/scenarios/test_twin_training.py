@@ -70,11 +70,13 @@ def test_what_is_trained_by_hand_is_kept_by_its_seed_and_that_of_its_exploration
     monkeypatch.setattr("scenarios.prepare.twins.train_twin", counted)
     (again,) = train_arms(scenario, [1], TINY, seed=6)
     assert (again.version, trained) == (first.version, [])
+    (other,) = train_arms(scenario, [1], TINY, seed=7)
+    assert (other.version != first.version, trained) == (True, [1])
     # Arms of one body and one plan, but other exploration: weights of seed 6 are not those of scenario 6.
     even = override(scenario, spread={"seed": 4, "scale": 0.0})
     (of_hand,) = train_arms(even, [1], TINY, seed=6)
     (of_fleet,) = train_arms(override(even, spread={"seed": 6, "scale": 0.0}), [1], TINY)
-    assert trained == [1, 1]
+    assert trained == [1, 1, 1]
     assert of_hand.seed == of_fleet.seed
     assert of_hand.data_hash != of_fleet.data_hash
 
