@@ -12,7 +12,6 @@ pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="needs make
 
 
 def make(goal: str, venv: Path, python: object) -> subprocess.CompletedProcess[str]:
-    """`make goal` with its environment in `venv`."""
     command = ["make", "-C", str(ROOT), "--no-print-directory", goal, f"VENV={venv}", f"PYTHON={python}"]
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
 

@@ -122,7 +122,6 @@ def test_every_test_of_a_trainer_has_its_adapter():
 
 
 def written_by_hand() -> list[Path]:
-    """Text files of the repository."""
     here = [
         ROOT / ".ci" / "run",
         *(path for path in ROOT.glob("*.*") if path.name != ".git"),  # a file in a worktree

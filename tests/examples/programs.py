@@ -11,13 +11,11 @@ ROOT = Path(__file__).parents[2]
 
 
 def program(name, *arguments):
-    """The command that runs an example."""
     return [sys.executable, "-u", str(ROOT / "examples" / f"{name}.py"), *map(str, arguments)]
 
 
 @contextmanager
 def killed_afterwards(process):
-    """A process that is killed at the end of the block."""
     try:
         yield process
     finally:

@@ -80,7 +80,6 @@ QUICK = ("--difficulty", "blind", "--bus", "memory", "--policy", "round_robin")
 
 
 def run_json(folder: Path) -> dict[str, Any]:
-    """The card of a run."""
     return json.loads((folder / "run.json").read_text(encoding="utf-8"))
 
 
@@ -134,7 +133,6 @@ def small_toml(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def scenario(small_toml: Path) -> Scenario:
-    """The small scenario."""
     return load(small_toml)
 
 
@@ -156,7 +154,6 @@ def bad(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def endpoint() -> Iterator[str]:
-    """A router."""
     with Router() as router:
         yield router.endpoint
 

@@ -45,7 +45,6 @@ def made_keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(tmp_path: Path, made_keys: Path) -> Path:
-    """A copy of one's own."""
     return shutil.copytree(made_keys, tmp_path / "keys")
 
 

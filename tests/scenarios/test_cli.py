@@ -304,8 +304,6 @@ def test_a_warning_is_one_line_where_there_is_no_terminal():
 
 @dataclass(frozen=True, kw_only=True)
 class Oven:
-    """An oven."""
-
     heat_c: float = option("Temperature, °C.", 180.0, low=0, high=300)
     mode: str = option("fan or grill.", "fan", choices=("fan", "grill"))
     minutes: int | None = option("Time, min.", None, low=0, high=600, above=True)
@@ -322,7 +320,6 @@ def run(*words, **defaults) -> Given | BaseException:
     received: list[Given] = []
 
     def bake(given: Annotated[Given, From(Oven, **defaults)], twice: bool = option("Again.", False)) -> None:
-        """Bake."""
         received.append(given)
 
     app = typer.Typer()

@@ -44,7 +44,6 @@ def reference(line) -> ShiftReference:
 
 @pytest.fixture(autouse=True)
 def known(monkeypatch: pytest.MonkeyPatch):
-    """References of the test split."""
     found = {(line.name, line.seed): reference(line) for line in manifest("test")}
     monkeypatch.setattr(leaderboard, "split_references", lambda split: found if split == "test" else {})
     return found

@@ -45,7 +45,6 @@ def logs(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def trained(logs, tmp_path_factory):
-    """The folder that training on the cool log gives."""
     out = tmp_path_factory.mktemp("trained") / "twins"
     arguments = ["twin", "train", "--log", logs / "cool", *TINY, "--out", out]
     with pytest.raises(SystemExit) as left:

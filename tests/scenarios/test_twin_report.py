@@ -45,7 +45,6 @@ HOT = [logged(f"hot_{i}", 45.0, seed=20 + i, load=3.0) for i in range(3)]
 
 @pytest.fixture(scope="module")
 def subject(tmp_path_factory):
-    """The twin of small logs."""
     folder = tmp_path_factory.mktemp("cache")
     return report.log_subject([*COOL, *HOT], 3, size=SMALL, folder=folder, config=TINY)
 

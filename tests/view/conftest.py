@@ -25,7 +25,6 @@ def thermofleet() -> Callable[..., None]:
 
 @pytest.fixture(scope="session")
 def run_folder(tmp_path_factory: pytest.TempPathFactory, thermofleet: Callable[..., None]) -> Path:
-    """Folder of a run of quickstart."""
     folder = tmp_path_factory.mktemp("shift") / "run"
     options = ["--policy", "round_robin", "--seed", 11, "--difficulty", "blind", "--bus", "memory"]
     thermofleet("run", "quickstart", *options, "--out", folder)
