@@ -77,6 +77,8 @@ def test_a_measured_excess_raises_the_predictions_for_that_work_of_all_arms(smal
     assert job_c == pytest.approx(hotter, abs=0.01)
     # Five jobs are left: rack, bench, rack, bench, rack.
     assert peaks(env, obs)[:, :5] == pytest.approx(np.tile([30.0, hotter, 30.0, hotter, 30.0], (3, 1)), abs=0.01)
+    obs, _ = env.reset()  # a new shift begins without measurements
+    assert peaks(env, obs) == pytest.approx(np.full((3, 6), 30.0))
 
 
 def test_the_excess_is_of_the_hottest_motor(small) -> None:
@@ -129,14 +131,6 @@ def test_without_a_difference_or_without_learning_nothing_changes(small, learns,
     env.reset()
     obs, *_ = env.step(np.array([[1, 0, 0]]))
     assert peaks(env, obs)[:, :5] == pytest.approx(np.full((3, 5), 30.0), abs=1e-4)
-
-
-def test_a_new_shift_begins_without_measurements(small) -> None:
-    env = env_of(small)
-    env.reset()
-    env.step(np.array([[1, 0, 0]]))
-    obs, _ = env.reset()
-    assert peaks(env, obs) == pytest.approx(np.full((3, 6), 30.0))
 
 
 def test_a_planner_simulates_the_heat_that_arms_have_measured(small) -> None:

@@ -1,6 +1,7 @@
 """Observations and action masks: every field against a reference from `World` and `State`, or worked by hand."""
 
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -340,7 +341,7 @@ def test_shifts_of_the_comparison_include_faults_returned_jobs_and_closed_space(
     limits = ThermalLimits(warning_c=56.0, error_c=60.0, restart_c=54.0, clear_s=25.0)
     make = small.Shifts(arms=3, jobs=9, ticks=80, ambient_c=45.0, limits=limits, crowding=0.3, absences=7)
     near = ((2,), (0,), (1,))
-    options = ({}, {"ahead_s": 11.5}, {"scaled": True, "bids": True}, {"scaled": True, "near": near, "ahead_s": 40.3})
+    options: tuple[dict[str, Any], ...] = ({}, {"ahead_s": 11.5}, {"scaled": True, "bids": True}, {"scaled": True, "near": near, "ahead_s": 40.3})
     played = [
         compare_with_reference(play, make(np.random.SeedSequence(seed)), seed, **each)
         for seed, each in enumerate(options)

@@ -79,7 +79,7 @@ def test_shifts_of_these_tests_terminate_and_truncate_at_different_times(many) -
     assert (terminated | truncated).sum(axis=0).min() >= 3  # each env is at least in its fourth shift
 
 
-@pytest.mark.parametrize("who", [[0], [1], [40], [63], [5, 6, 7, 8, 9, 10, 11], [63, 2, 31, 0, 17, 30, 44]])
+@pytest.mark.parametrize("who", [[1], [5, 6, 7, 8, 9, 10, 11], [63, 2, 31, 0, 17, 30, 44]])
 def test_a_row_does_not_depend_on_the_other_rows_or_their_order(many, batch, play, who) -> None:
     trace = played(batch(len(who), SHIFT, seed=[SEED + e for e in who]), play, who)
     for one, all_rows in zip(trace, many, strict=True):
@@ -95,8 +95,7 @@ def test_a_row_of_a_thousand_equals_the_row_alone(library, play) -> None:
             play.same(row(one, 0), row(all_rows, e))
 
 
-@pytest.mark.parametrize("keep_events", [False, True])
-@pytest.mark.parametrize("e", [0, 1, 5, 40])
+@pytest.mark.parametrize(("e", "keep_events"), [(0, False), (40, True)])
 def test_a_row_equals_the_single_env_over_several_episodes(many, make, play, e, keep_events) -> None:
     env = make(SHIFT, keep_events=keep_events)
     contained(play, play.single(env, env.reset(seed=SEED + e)), row(many[0], e))
@@ -118,7 +117,7 @@ def contained(play, actual: dict[str, Any], expected: dict[str, Any]) -> None:
     play.same(actual, {name: expected[name] for name in actual})
 
 
-@pytest.mark.parametrize("threads", [2, 3, 7])
+@pytest.mark.parametrize("threads", [3, 7])
 def test_results_do_not_depend_on_the_number_of_threads(library, play, threads) -> None:
     who = list(range(2 * BLOCK + 40))
     one, several = (played(BatchEnv(library, len(who), seed=SEED, threads=n), play, who, 30) for n in (1, threads))
@@ -129,8 +128,8 @@ def test_results_do_not_depend_on_the_number_of_threads(library, play, threads) 
 LATE = Channel(delay_s=25.0, loss=0.3)
 
 
-@pytest.mark.parametrize("e", [0, 3, 6])
-def test_a_row_with_an_exchange_equals_the_single_env(make, batch, play, e) -> None:
+def test_a_row_with_an_exchange_equals_the_single_env(make, batch, play) -> None:
+    e = 3
     arms = make(SHIFT).possible_agents
     exchanges = [Exchange(arms, LATE) for _ in range(7)]
     env, many = make(SHIFT, exchange=Exchange(arms, LATE)), batch(7, SHIFT, seed=SEED, exchanges=exchanges)
@@ -296,14 +295,14 @@ if sys.argv[1] == "kept":
     assert keep_pages()
 for _ in range(2):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    np.ones(20_000_000)
+    np.ones(5_000_000)
 print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="mallopt is glibc's")
 def test_keep_pages_reuses_memory() -> None:
-    """Allocate 160 MB twice: the second time the process gets no new pages."""
+    """Allocate 40 MB twice: the second time the process gets no new pages."""
     faults = {
         how: int(subprocess.run([sys.executable, "-c", TURNOVER, how], capture_output=True, check=True).stdout)
         for how in ("given back", "kept")
@@ -327,9 +326,9 @@ def actions_of(play, mask: np.ndarray, step: int) -> np.ndarray:
     return play.chosen(mask, np.random.default_rng(step).random((1, 3, 2)))
 
 
-@pytest.mark.parametrize("difficulty", ["blind", "oracle"])
-@pytest.mark.parametrize("e", [0, 5])
-@pytest.mark.parametrize("randomise", [None, VARIED], ids=["plain", "randomised"])
+@pytest.mark.parametrize(
+    ("difficulty", "e", "randomise"), [("blind", 0, None), ("oracle", 5, VARIED)], ids=["plain", "randomised"]
+)
 def test_a_row_equals_make_env_with_the_same_seed(cell, plans, play, e, difficulty, randomise) -> None:
     options: dict[str, Any] = {"difficulty": difficulty, "randomise": randomise, "cache": plans}
     batch, env = make_batch(cell, 6, LAST_SEED, **options), make_env(cell, **options)
@@ -376,11 +375,11 @@ def test_a_shift_as_arrays_has_the_jobs_of_the_scenario(fleet, seed) -> None:
 
 def test_policies_are_compared_on_the_shifts_that_run_plays(cell, plans) -> None:
     fleets = [prepare(cell, difficulty="blind", randomise=each, cache=plans) for each in (None, VARIED)]
-    rewards = [[outcome.reward for outcome in outcomes(fleet, "wspt", range(6))] for fleet in fleets]
+    rewards = [[outcome.reward for outcome in outcomes(fleet, "wspt", range(3))] for fleet in fleets]
     for fleet, expected in zip(fleets, rewards, strict=True):
-        specs = [RunSpec(policy="wspt", seed=seed, bus="memory", difficulty="blind") for seed in range(6)]
+        specs = [RunSpec(policy="wspt", seed=seed, bus="memory", difficulty="blind") for seed in range(3)]
         assert [run(fleet, spec, record=False).reward for spec in specs] == pytest.approx(expected)
-    assert sum(one != other for one, other in zip(*rewards, strict=True)) == 6
+    assert sum(one != other for one, other in zip(*rewards, strict=True)) == 3
 
 
 def test_an_empty_randomisation_changes_nothing(fleet) -> None:
@@ -393,21 +392,21 @@ def test_an_empty_randomisation_changes_nothing(fleet) -> None:
 def test_randomised_values_cover_their_range(fleet) -> None:
     randomise = Randomisation(ambient_k=(-2.0, 6.0), arrivals=(0.5, 2.0))
     library = library_of(replace(fleet, randomise=randomise, variants=(fleet, fleet)))
-    shifts = [library.draw(np.random.SeedSequence(seed)) for seed in range(300)]
+    shifts = [library.draw(np.random.SeedSequence(seed)) for seed in range(200)]
     offset_k = np.array([shift.ambient_offset_k for shift in shifts])
     assert -2.0 <= offset_k.min() < -1.8
     assert 5.8 < offset_k.max() <= 6.0
-    assert offset_k.mean() == pytest.approx(2.0, abs=4 * 8.0 / np.sqrt(12 * 300))
+    assert offset_k.mean() == pytest.approx(2.0, abs=4 * 8.0 / np.sqrt(12 * 200))
     fleets = np.bincount([shift.fleet for shift in shifts], minlength=3)
     assert len(fleets) == 3
-    assert np.abs(fleets - 100).max() < 4 * np.sqrt(300 * 2 / 9)
+    assert np.abs(fleets - 200 / 3).max() < 4 * np.sqrt(200 * 2 / 9)
     # 240 s / 60 s + 200 s / 40 s = 9 jobs, times 1.25 on average, and 3 at once.
     often = Randomisation(arrivals=(3.0, 3.0))
     for chosen, expected in ((Randomisation(), 12.0), (randomise, 3 + 9 * 1.25), (often, 3 + 9 * 3.0)):
         counts = [
-            len(library_of(replace(fleet, randomise=chosen)).draw(np.random.SeedSequence(s)).kind) for s in range(200)
+            len(library_of(replace(fleet, randomise=chosen)).draw(np.random.SeedSequence(s)).kind) for s in range(100)
         ]
-        assert np.mean(counts) == pytest.approx(expected, abs=4 * np.std(counts) / np.sqrt(200))
+        assert np.mean(counts) == pytest.approx(expected, abs=4 * np.std(counts) / np.sqrt(100))
 
 
 def test_randomisation_depends_on_the_seed_and_not_on_noise(fleet, play) -> None:
