@@ -39,14 +39,6 @@ def test_jobs_done_in_the_last_step_terminate_and_do_not_truncate(make, play) ->
     assert last(steps - 1) == (steps - 1, False, True)
 
 
-def test_the_fleet_is_rendered_as_text(make) -> None:
-    env = make(render_mode="ansi")
-    env.reset(seed=0)
-    lines = (env.render() or "").splitlines()
-    assert [line.split()[:2] for line in lines[1:]] == [[f"arm_{i}", "idle"] for i in range(3)]
-    assert make().render() is None
-
-
 def test_watcher_and_event_log_record_every_step(make, play) -> None:
     steps = []
     env = make(watch=steps.append, keep_events=True)

@@ -205,7 +205,6 @@ def test_num_envs_and_max_cycles_must_be_positive(batch, count) -> None:
 
 
 def beyond(cell) -> dict[str, Any]:
-    """Return the cell with its shelf out of reach."""
     places = [{"name": p.name, "position_m": list(p.position_m)} for p in cell.places]
     places[1]["position_m"] = [9.0, 0.0, 0.2]
     return {"places": places}

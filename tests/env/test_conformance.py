@@ -154,7 +154,6 @@ def test_infos_of_a_reset_are_of_the_new_shift(batch, small) -> None:
 
 
 def fits(space: Any, observed: Any) -> None:
-    """Assert that an observation is in its space and finite."""
     assert space.contains(observed)
     assert np.isfinite(observed["observation"] if isinstance(space, Dict) else observed).all()
 

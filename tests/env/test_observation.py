@@ -341,7 +341,12 @@ def test_shifts_of_the_comparison_include_faults_returned_jobs_and_closed_space(
     limits = ThermalLimits(warning_c=56.0, error_c=60.0, restart_c=54.0, clear_s=25.0)
     make = small.Shifts(arms=3, jobs=9, ticks=80, ambient_c=45.0, limits=limits, crowding=0.3, absences=7)
     near = ((2,), (0,), (1,))
-    options: tuple[dict[str, Any], ...] = ({}, {"ahead_s": 11.5}, {"scaled": True, "bids": True}, {"scaled": True, "near": near, "ahead_s": 40.3})
+    options: tuple[dict[str, Any], ...] = (
+        {},
+        {"ahead_s": 11.5},
+        {"scaled": True, "bids": True},
+        {"scaled": True, "near": near, "ahead_s": 40.3},
+    )
     played = [
         compare_with_reference(play, make(np.random.SeedSequence(seed)), seed, **each)
         for seed, each in enumerate(options)
@@ -529,17 +534,6 @@ def test_slots_hold_each_arm_s_own_view_of_the_jobs(small) -> None:
     assert observed.action_mask[0].tolist() == [[1, 1, 1, 0, 0], [1, 1, 0, 0, 0]]
 
 
-def test_jobs_that_share_a_station_have_the_group_of_the_first(small) -> None:
-    """Three jobs at the bench, one of them to the rack as well."""
-    content = [small.work("bench"), small.work("press"), small.work("bench", to="rack"), small.work("rack"),
-               small.work("bench", small.HOT)]  # fmt: skip
-    world, _ = small.shop([[small.job(f"j{i}", each) for i, each in enumerate(content)]], slots=6)
-    observed = observe(world, initial(world))
-    assert observed.group[0].tolist() == [[1, 2, 1, 1, 1, 0]] * 2
-    assert observed.offered[0].tolist() == [[True] * 5 + [False]] * 2
-    assert observed.station_free[0].tolist() == [[1] * 5 + [0]] * 2
-
-
 def test_an_arm_broadcasts_what_it_measures_and_its_scores(small) -> None:
     content = small.work()
     arms = [small.arm(i, [content], motors=NO_NOISE) for i in range(2)]
@@ -561,19 +555,6 @@ def test_an_arm_broadcasts_what_it_measures_and_its_scores(small) -> None:
 
 
 # Peers and sensors in an episode
-
-
-def test_a_delayed_message_is_as_old_as_its_delay(small) -> None:
-    exchange = Exchange(("arm_0", "arm_1"), Channel(delay_s=20.0))
-    env = parallel_env(small.Shifts(arms=2), exchange=exchange)
-    env.reset(seed=1)
-    ages = []
-    for _ in range(5):
-        observed = env.knowledge()["arm_0"]
-        ages.append((float(observed.peer_heard[0]), float(observed.peer_age_s[0])))
-        env.step({})
-    assert ages == [(0.0, LONG_S), (0.0, LONG_S), (1.0, 20.0), (1.0, 20.0), (1.0, 20.0)]
-    env.close()
 
 
 def test_temperatures_are_measured_with_the_noise_of_the_sensors(small) -> None:

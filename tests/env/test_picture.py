@@ -124,7 +124,6 @@ def luminance(colour: Any) -> np.ndarray:
 
 
 def around(frame: np.ndarray, plan: FloorPlan, arm: int) -> np.ndarray:
-    """Return the part of a picture around an arm."""
     x, y = plan.centres[arm].round().astype(int)
     return frame[y - plan.reach : y + plan.reach + 1, x - plan.reach : x + plan.reach + 1]
 

@@ -60,13 +60,11 @@ def row(step: dict[str, Any], e: int) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def library(small) -> Library:
-    """Return the library of these shifts."""
     return small.Shifts(**SHIFT).library()
 
 
 @pytest.fixture(scope="module")
 def many(library, play) -> list[dict[str, Any]]:
-    """Return all results of 64 envs."""
     return played(BatchEnv(library, 64, seed=SEED), play, list(range(64)))
 
 
@@ -113,7 +111,6 @@ def test_a_row_equals_the_single_env_over_several_episodes(many, make, play, e, 
 
 
 def contained(play, actual: dict[str, Any], expected: dict[str, Any]) -> None:
-    """Assert that all actual values are among the expected ones."""
     play.same(actual, {name: expected[name] for name in actual})
 
 
@@ -236,11 +233,9 @@ def test_growing_the_job_arrays_changes_no_result(small, library, play) -> None:
     few, lots = library.draw, small.Shifts(**{**SHIFT, "jobs": 23}).library().draw
     mixing = replace(library, draw=lambda seed: (lots if seed.entropy == 2 else few)(seed))
     mixed, alone = BatchEnv(mixing, 3, seed=0), BatchEnv(library, 2, seed=0)
-    one, other, rng = mixed.reset(), alone.reset(), np.random.default_rng(0)
-    for _ in range(12):
-        play.same(play.rows(one, range(2)), play.rows(other, range(2)))
-        actions = play.chosen(one[0]["action_mask"], rng.random((3, 3, 2)))
-        one, other = mixed.step(actions), alone.step(actions[:2])
+    for one, other in zip(played(mixed, play, [0, 1, 2], 12), played(alone, play, [0, 1], 12), strict=True):
+        for e in range(2):
+            play.same(row(one, e), row(other, e))
     assert mixed.state.status.shape[1] >= 23 > alone.state.status.shape[1]
 
 
@@ -317,7 +312,6 @@ VARIED = Randomisation(ambient_k=(-1.0, 3.0), arrivals=(0.8, 1.5), variants=[{"s
 
 @pytest.fixture(scope="module")
 def fleet(cell, plans) -> Fleet:
-    """Return the prepared cell."""
     return prepare(cell, difficulty="blind", cache=plans)
 
 
@@ -493,8 +487,5 @@ def test_variants_with_different_risk_models_do_not_mix(small, play) -> None:
         in_all = replace(shifts[fleet], fleet=fleet)
         alone = BatchEnv(Library(names, 4, own_tables, lambda _, fleet=fleet: shifts[fleet]), 1, seed=0)
         among = BatchEnv(Library(names, 4, together, lambda _, shift=in_all: shift), 1, seed=0)
-        one, other = alone.reset(), among.reset()
-        for step in range(40):
-            play.same(play.rows(one, 0), play.rows(other, 0))
-            actions = actions_of(play, one[0]["action_mask"], step)
-            one, other = alone.step(actions), among.step(actions)
+        for one, other in zip(played(alone, play, [0], 40), played(among, play, [0], 40), strict=True):
+            play.same(one, other)
