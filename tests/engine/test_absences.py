@@ -1,7 +1,5 @@
 """Breaks and failures of arms: what becomes of their jobs, by the phases (approach 3 s, cycle 10 s, retreat 2 s)."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -138,19 +136,3 @@ def test_a_simulator_for_policies_knows_breaks_and_no_future_failures(small) -> 
     simulator.look(runner.engine, 0, seen)
     known = simulator._engine.state.absences[0]
     assert [each for each in known.tolist() if each[3]] == [(0, 5, 9, FINISH_JOB), (0, 0, 2, BROKEN)]
-
-
-def test_without_absences_nothing_changes(small) -> None:
-    make = small.Shifts(arms=3, jobs=9, ticks=60, ambient_c=45.0)
-    episode = make(np.random.SeedSequence(3))
-    (shift,) = episode.world.shifts
-    never = np.array([(0, 10**6, 10**6 + 1, BROKEN)], shift.absences.dtype)
-    late = replace(episode.world, shifts=(replace(shift, absences=never),))
-    results = []
-    for world in (episode.world, late):
-        runner, rng = Single(replace(episode, world=world)), np.random.default_rng(3)
-        outcomes = []
-        while runner.tick < world.ticks:
-            outcomes.append(runner.step(np.array([rng.choice(np.flatnonzero(mask)) for mask in runner.mask])).tolist())
-        results.append((outcomes, runner.state.temp_c.tolist(), runner.state.mode.tolist()))
-    assert results[0] == results[1]

@@ -1,7 +1,5 @@
 """Times of limit crossings against SciPy, and the effects of warnings, faults and recoveries."""
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -42,7 +40,6 @@ def hot_shop(small, *, payload_kg=8.0, repetitions=200, arms=1, start_c=25.0, **
 
 
 def hottest(temp_c) -> np.ndarray:
-    """Return the temperature of the hottest motor, from [..., node]."""
     return temp_c[..., WINDING].max(axis=-1)
 
 
@@ -121,23 +118,6 @@ def test_time_above_the_warning_limit_is_exact(small) -> None:
     assert last.above_warning_s[0, 0] == pytest.approx(above, abs=0.05)
     assert last.peak_c[0, 0] == pytest.approx(max(hottest(s.state.temp_c)[0, 0] for s in steps))
     assert len([e for e in log if e.kind == "warning"]) == 1
-
-
-def test_a_returned_job_keeps_its_complete_cycles(small) -> None:
-    world, plant = hot_shop(small, repetitions=22, limits=ThermalLimits(restart_c=28.0), ticks=1200)
-    log: list[Event] = []
-    steps = work_on(world, plant, log)
-    fault, back, awards = one(log, "fault"), one(log, "return"), [e for e in log if e.kind == "award"]
-    kept = math.floor((fault.time_s - awards[0].time_s - 3.0) / 10.0)
-    assert 0 < kept < 22
-    assert (back.time_s, back.value) == (fault.time_s, kept)
-    finishes = [e for e in log if e.kind == "finish"]
-    returns = [e for e in log if e.kind == "return"]
-    left = 22 - sum(e.value for e in returns)
-    assert len(finishes) == 1
-    assert finishes[0].time_s == pytest.approx(awards[-1].time_s + 3.0 + left * 10.0)
-    assert steps[-1].state.cycles[0, 0] == 22
-    assert steps[-1].state.returns[0, 0] == len(returns)
 
 
 def test_a_fault_on_the_way_home_returns_nothing(small) -> None:

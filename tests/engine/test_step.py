@@ -122,18 +122,6 @@ def test_a_long_job_follows_the_heat_law_integrated_by_scipy(small) -> None:
     assert got == pytest.approx(law.y[:, -1], abs=0.15)  # the loss lags by a step
 
 
-def test_temperatures_converge_with_the_step_size(small) -> None:
-    content = small.work(payload_kg=small.WARM)
-    ends = []
-    for dt_s in (10.0, 5.0, 1.0):
-        world, plant = small.shop([[small.job("a", content, repetitions=200)]], dt_s=dt_s, ticks=round(600 / dt_s))
-        ends.append(play(world, plant, [[1, 0]])[-1].state.temp_c)
-    coarse, middle, fine = ends
-    assert np.abs(coarse - fine).max() < 0.2
-    # First order: the error is proportional to the step. Against 1 s, e(10) : e(5) = 9 : 4.
-    assert np.abs(coarse - fine).max() / np.abs(middle - fine).max() == pytest.approx(9 / 4, rel=0.1)
-
-
 def test_an_idle_warm_fleet_is_in_steady_state(small) -> None:
     content = small.work()
     world, plant = small.shop([[]], arms=[small.arm(0, [content])], ticks=60, start_warm=True)

@@ -96,7 +96,6 @@ GIVE_BACK = 1 + 4 + 1 - 1
 
 
 def play_out(world, plant, actions, log):
-    """Step through one action of arm 0 each; the other arms wait."""
     state = initial(world)
     for action in actions:
         row = np.zeros((1, len(world.arms)), int)
