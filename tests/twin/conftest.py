@@ -74,8 +74,6 @@ def twin(records: list[np.ndarray], small: TwinConfig) -> Twin:
 
 @pytest.fixture(scope="session")
 def recording_of() -> Callable[[float], Recording]:
-    """A recording of smooth motion that lasts some seconds."""
-
     def make(seconds: float) -> Recording:
         q, qd, tau = smooth_motion(np.random.default_rng(3), seconds).astype(float).swapaxes(0, 1)
         return Recording(name="log", time_s=np.arange(len(q)) / RATE_HZ, q=q, qd=qd, tau=tau)

@@ -26,7 +26,7 @@ from fleet.readings import (
 )
 from fleet.robot import Robot
 from twin.logs.reader import of_arm, read
-from twin.logs.recording import READINGS, Recording, stretches
+from twin.logs.recording import READINGS, Recording
 
 ARM = ArmModel(Robot(name="logged"))
 TORQUE_PER_AMP = np.array([10.2] * 4 + [6.6] * 3)
@@ -52,7 +52,6 @@ class Log:
         return "\n".join([separator.join(names), *lines]) + "\n"
 
     def plain(self) -> "Log":
-        """The same in rad with the torque of the motor."""
         scaled = {name: v * f for (name, v), f in zip(self.groups.items(), PLAIN_FACTORS, strict=True)}
         scaled["Pos"] = (scaled["Pos"] + np.pi) % (2 * np.pi) - np.pi
         return Log(self.time_s, scaled)
@@ -304,14 +303,6 @@ def test_damaged_lines_are_named_and_cut_out(name: str, tmp_path: Path):
     assert recording.dropped
 
 
-def test_stale_rows_are_a_gap(tmp_path: Path):
-    path = tmp_path / "log.csv"
-    path.write_text(stale(sound(), 100, 130), encoding="utf-8")
-    (recording,) = read(path, damaged="skip")
-    before, after = stretches(recording, 2.0)
-    assert after.time_s[0] - before.time_s[-1] > 14.0
-
-
 def test_a_short_hold_is_told_but_stays(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     # The logger of the public logs repeats up to 13 rows.
     path = tmp_path / "log.csv"
@@ -522,22 +513,6 @@ def test_a_log_with_the_other_sign_among_those_of_one_arm_is_told(caplog: pytest
     caplog.clear()
     of_arm(logs[::2], None, Path("logs"))
     assert not caplog.text
-
-
-def test_a_planned_motion_has_no_sensors(tmp_path: Path) -> None:
-    """The torque of a vertical axis is 0 all the time."""
-    time_s = np.arange(0.0, 60.0, 0.1)
-    q = np.zeros((len(time_s), 7))
-    q[:, 0] = 0.01 * time_s
-    head = ",".join(["time_s", *(f"{name}_{j}" for name in ("q", "qd", "tau") for j in range(1, 8))])
-    qd = np.zeros_like(q)
-    qd[:, 0] = 0.01
-    tau = np.zeros_like(q)
-    tau[:, 1] = 20.0 + 0.1 * np.sin(time_s)
-    path = tmp_path / "plan.csv"
-    rows = np.column_stack([time_s, q, qd, tau])
-    path.write_text("\n".join([head, *(",".join(map(repr, row.tolist())) for row in rows)]) + "\n", encoding="utf-8")
-    assert len(read(path, measured=False)[0].time_s) == len(time_s)
 
 
 PLANS: dict[str, tuple[Callable[[dict[str, np.ndarray]], object], str]] = {
