@@ -184,33 +184,6 @@ def test_a_step_ends_as_soon_as_an_arm_may_claim_a_job(small) -> None:
         assert ended or may_claim or warned.any()
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-def test_a_batch_steps_as_the_single_environment(small, threads) -> None:
-    shifts, envs = small.Shifts(ticks=60, absences=5), 5
-    batch = BatchEnv(shifts.library(), envs, seed=SEED, autoreset=False, decisions="events", threads=threads)
-    obs, _ = batch.reset()
-    rewards, seconds = np.zeros(envs), np.zeros(envs)
-    running = np.ones(envs, bool)
-    final = {}
-    while running.any():
-        obs, reward, over, cut, info = batch.step(first_legal(obs["action_mask"]))
-        rewards[running] += reward[running]
-        seconds[running] += info["elapsed_s"][running]
-        ended = over | cut
-        state = batch.state
-        final |= {e: (state.finished_s[e], state.temp_c[e]) for e in np.flatnonzero(ended & running).tolist()}
-        running &= ~ended
-        if running.any():
-            obs, _ = batch.reset(rows=ended)
-    for e in range(envs):
-        truth, single, spans = played(parallel_env(shifts, decisions="events"), SEED + e)
-        jobs = truth.finished_s.shape[1]
-        np.testing.assert_array_equal(final[e][0][:jobs], truth.finished_s[0])
-        np.testing.assert_array_equal(final[e][1], truth.temp_c[0])
-        assert rewards[e] == pytest.approx(sum(single), rel=1e-12)
-        assert seconds[e] == sum(spans)
-
-
 def test_bad_choices_are_refused(small) -> None:
     shifts = small.Shifts()
     for given in ("event", None, 1):

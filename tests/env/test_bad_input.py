@@ -204,19 +204,6 @@ def test_num_envs_and_max_cycles_must_be_positive(batch, count) -> None:
             batch(2, max_cycles=count)
 
 
-def beyond(cell) -> dict[str, Any]:
-    places = [{"name": p.name, "position_m": list(p.position_m)} for p in cell.places]
-    places[1]["position_m"] = [9.0, 0.0, 0.2]
-    return {"places": places}
-
-
-def test_jobs_that_no_arm_can_do_are_refused_with_a_remedy(cell, plans) -> None:
-    message = r"jobs\[1\]\.places: no arm can do 'sort' with 0\.2 or 0\.5 kg \(left at 'shelf': .+\); move the places"
-    for make in MAKERS:
-        with pytest.raises(ScenarioError, match=message):
-            make(cell, difficulty="blind", cache=plans, **beyond(cell))
-
-
 def test_unknown_overrides_are_refused_with_the_nearest_name(cell, plans) -> None:
     for make in MAKERS:
         with pytest.raises(ScenarioError, match=r"unknown key 'horizon'; did you mean 'horizon_s'"):
@@ -298,9 +285,8 @@ def test_variants_with_other_arms_are_refused(cell, plans) -> None:
                 make_batch(cell, 2, difficulty="blind", cache=plans, randomise=randomise)
 
 
-@pytest.mark.parametrize("warmer_k", [(0.0, 1e6), (-1000.0, 0.0)])
-def test_invalid_ambient_temperatures_are_refused(cell, plans, warmer_k) -> None:
-    randomise = Randomisation(ambient_k=warmer_k)
+def test_too_low_ambient_temperatures_are_refused(cell, plans) -> None:
+    randomise = Randomisation(ambient_k=(-1000.0, 0.0))
     with pytest.raises(ScenarioError, match=r"ambient_k \(.+\) goes too far: .+ between -40 and 60 °C \(got \["):
         make_batch(cell, 2, difficulty="blind", cache=plans, randomise=randomise)
 

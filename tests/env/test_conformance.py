@@ -111,32 +111,6 @@ def test_results_of_a_parallel_env_are_in_its_spaces(make, play, options) -> Non
     assert ended == [0] * (len(ended) - 1) + [1]
 
 
-def test_results_of_a_batch_are_in_its_spaces(batch, play) -> None:
-    env, rng = batch(9, HOT, seed=0), np.random.default_rng(0)
-    given = env.reset()
-    keys = list(given[1])
-    for _ in range(100):
-        obs, info = given[0], given[-1]
-        for each in (obs, info["final_obs"]):
-            for arms in zip(env.joined(each)["observation"], each["action_mask"], strict=True):
-                for vector, mask in zip(*arms, strict=True):
-                    fits(env.single_observation_space, {"observation": vector, "action_mask": mask})
-        assert list(info) == keys
-        assert {name: (v.dtype.kind, v.shape) for name, v in info.items() if not name.startswith("final")} == {
-            **{name: ("f", (9, 3)) for name in ("faults", "illegal", "peak_c", "above_warning_s")},
-            "jobs_done": ("f", (9,)),
-            "elapsed_s": ("f", (9,)),
-            **{f"reward_{name}": ("f", (9,)) for name in TERMS},
-        }
-        actions = play.chosen(obs["action_mask"], rng.random((9, 3, 2)))
-        given = env.step(actions)
-        _, reward, terminated, truncated, info = given
-        assert [(v.dtype, v.shape) for v in given[1:4]] == [(float, (9,)), (bool, (9,)), (bool, (9,))]
-        np.testing.assert_allclose(reward, sum(info[f"reward_{name}"] for name in TERMS), atol=1e-12)
-        assert not (terminated & truncated).any()
-        np.testing.assert_array_equal(np.flatnonzero(terminated | truncated), info["final_envs"])
-
-
 def test_infos_of_a_reset_are_of_the_new_shift(batch, small) -> None:
     env = batch(4, HOT, seed=0)
     for _ in range(2):

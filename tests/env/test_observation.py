@@ -430,7 +430,8 @@ def observe(world: World, state: State, **options) -> Observation:
 # Single fields
 
 
-def test_peers_are_the_others_in_order() -> None:
+@pytest.mark.parametrize("near", [None, ((2, 1), (3, 0), (3, 1), (0, 2))], ids=["all", "nearest"])
+def test_peers_are_those_of_the_layout_in_its_order(near) -> None:
     receiver, sender = np.indices((4, 4))
     view = received(
         4, 2,
@@ -439,28 +440,18 @@ def test_peers_are_the_others_in_order() -> None:
         difficulty=np.stack([receiver + sender / 10, np.full((4, 4), np.nan)], axis=-1),
         mode=np.where(sender == 3, FAULTED, np.where(sender == 1, WORKING, IDLE)),
     )  # fmt: skip
-    observed = peers_of(Layout(4, 2, delivered=True), view)
+    observed = peers_of(Layout(4, 2, near, delivered=True), view)
     for me in range(4):
-        others = [a for a in range(4) if a != me]
+        others = [a for a in range(4) if a != me] if near is None else list(near[me])
+        assert observed.peers[me].tolist() == (others if near is None else [0, 1])
         assert observed.peer_headroom_k[me].tolist() == [10.0 * me + a for a in others]
         assert observed.peer_age_s[me].tolist() == [100.0 * me + a for a in others]
         assert observed.peer_difficulty[me, :, 0].tolist() == pytest.approx([me + a / 10 for a in others])
-        assert observed.peer_known[me].tolist() == [[1, 0]] * 3
+        assert observed.peer_known[me].tolist() == [[1, 0]] * len(others)
         assert (observed.peer_difficulty[me, :, 1] == -1).all()
-        assert observed.peers[me].tolist() == others
-        assert observed.fleet_headroom_k[me].tolist() == [10.0 * me + a for a in range(4)]
         assert observed.peer_working[me].tolist() == [a == 1 for a in others]
         assert observed.peer_faulted[me].tolist() == [a == 3 for a in others]
         assert observed.peer_heard[me].all()
-
-
-def test_nearest_peers_are_in_the_order_of_the_layout() -> None:
-    near = ((2, 1), (3, 0), (3, 1), (0, 2))
-    _, sender = np.indices((4, 4))
-    observed = peers_of(Layout(4, 2, near, delivered=True), received(4, 2, headroom_k=1.0 * sender))
-    assert observed.peer_headroom_k.tolist() == [list(map(float, peers)) for peers in near]
-    assert observed.fleet_headroom_k.tolist() == observed.peer_headroom_k.tolist()
-    assert observed.peers.tolist() == [[0, 1]] * 4
 
 
 def test_a_peer_whose_messages_never_arrived_is_unknown() -> None:

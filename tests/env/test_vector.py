@@ -4,7 +4,7 @@ import gc
 import platform
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +18,7 @@ from fleet.bus.exchange.memory import Exchange
 from fleet.engine.batch import BLOCK
 from fleet.engine.tables import stack_tables
 from fleet.engine.world import Space
+from fleet.env.allocation_v2 import AllocationEnv
 from fleet.env.vector import BatchEnv, Library, Shelf
 from fleet.motion import Plan
 from scenarios.evaluate.rollout import outcomes
@@ -93,25 +94,57 @@ def test_a_row_of_a_thousand_equals_the_row_alone(library, play) -> None:
             play.same(row(one, 0), row(all_rows, e))
 
 
-@pytest.mark.parametrize(("e", "keep_events"), [(0, False), (40, True)])
-def test_a_row_equals_the_single_env_over_several_episodes(many, make, play, e, keep_events) -> None:
-    env = make(SHIFT, keep_events=keep_events)
-    contained(play, play.single(env, env.reset(seed=SEED + e)), row(many[0], e))
-    for step, each in zip(many[1:], numbers(e), strict=True):
-        mask = np.stack([observed.action_mask for observed in env.knowledge().values()])
-        actions = dict(zip(env.possible_agents, play.chosen(mask, each).tolist(), strict=True))
-        actual, expected = play.single(env, env.step(actions)), row(step, e)
+ARMS = ("arm_0", "arm_1", "arm_2")
+LATE = Channel(delay_s=25.0, loss=0.3)
+
+
+def both(
+    batch: BatchEnv, env: AllocationEnv, e: int, seed: int, play, *, steps: int = STEPS, rtol: float = 0.0
+) -> Iterator[dict[str, Any]]:
+    """What a single env returns at each step; everything equals row `e` of a batch with the same actions."""
+    given, observed = batch.reset(), play.single(env, env.reset(seed=seed))
+    for step in range(steps):
+        obs = given[0]
+        play.same({n: v[e : e + 1] for n, v in obs.items()}, {n: observed[n] for n in obs})
+        together = play.named(batch.knowledge())
+        for a, known in enumerate(env.knowledge().values()):
+            play.same({name: values[e, a] for name, values in together.items()}, play.named(known))
+        np.testing.assert_array_equal(batch.state.temp_c[e], env.truth.temp_c[0])
+        actions = actions_of(play, obs["action_mask"], step)
+        given = batch.step(actions)
+        observed = play.single(env, env.step(dict(zip(env.possible_agents, actions[e].tolist(), strict=True))))
+        expected = play.rows(given, e)
         assert expected["ended"][0] == (not env.agents)
+        final = "" if env.agents else "final_"
+        for n, values in observed.items():
+            np.testing.assert_allclose(values, expected[f"{final}{n}" if n in obs else n], rtol=rtol, err_msg=n)
+        yield observed
         if not env.agents:
-            last = {name: actual[name] for name in ("shared", "own", "action_mask")}
-            play.same(last, {name: expected[f"final_{name}"] for name in last})
-            first = play.single(env, env.reset())
-            actual |= {name: first[name] for name in last}
-        contained(play, actual, expected)
+            observed = play.single(env, env.reset())
 
 
-def contained(play, actual: dict[str, Any], expected: dict[str, Any]) -> None:
-    play.same(actual, {name: expected[name] for name in actual})
+def actions_of(play, mask: np.ndarray, step: int) -> np.ndarray:
+    """Return actions that do not depend on the number of rows."""
+    return play.chosen(mask, np.random.default_rng(step).random((1, 3, 2)))
+
+
+@pytest.mark.parametrize(
+    ("e", "single", "many"),
+    [
+        (0, {}, {}),
+        (5, {"keep_events": True}, {}),
+        (3, {"decisions": "events"}, {"decisions": "events", "threads": 2}),
+        (3, {"exchange": Exchange(ARMS, LATE)}, {"exchanges": [Exchange(ARMS, LATE) for _ in range(7)]}),
+    ],
+    ids=["interval", "events recorded", "steps until events", "late messages"],
+)
+def test_a_row_equals_the_single_env_over_several_shifts(make, batch, play, e, single, many) -> None:
+    shift = {**SHIFT, "absences": 5}
+    together, alone = batch(7, shift, seed=SEED, **many), make(shift, **single)
+    rtol = 1e-12 if "decisions" in single else 0.0  # rewards of intervals are added up in another order
+    steps = list(both(together, alone, e, SEED + e, play, rtol=rtol))
+    assert sum(bool(step["terminated"] | step["truncated"]) for step in steps) > 1
+    assert len({float(step["elapsed_s"][0]) for step in steps}) > 1 or "decisions" not in single
 
 
 @pytest.mark.parametrize("threads", [3, 7])
@@ -122,38 +155,9 @@ def test_results_do_not_depend_on_the_number_of_threads(library, play, threads) 
         play.same(a, b)
 
 
-LATE = Channel(delay_s=25.0, loss=0.3)
-
-
-def test_a_row_with_an_exchange_equals_the_single_env(make, batch, play) -> None:
-    e = 3
-    arms = make(SHIFT).possible_agents
-    exchanges = [Exchange(arms, LATE) for _ in range(7)]
-    env, many = make(SHIFT, exchange=Exchange(arms, LATE)), batch(7, SHIFT, seed=SEED, exchanges=exchanges)
-    actual, given = play.single(env, env.reset(seed=SEED + e)), many.reset()
-    arrived, ends = [], 0
-    for each in np.stack([numbers(e) for e in range(7)], axis=1):
-        play.same({n: actual[n] for n in given[0]}, {n: values[[e]] for n, values in given[0].items()})
-        for a, observed in enumerate(env.knowledge().values()):
-            arrived.append(observed.peer_heard.mean())
-            together = play.named(many.knowledge())
-            play.same({name: values[e, a] for name, values in together.items()}, play.named(observed))
-        actions = play.chosen(given[0]["action_mask"], each)
-        step = env.step(dict(zip(arms, actions[e].tolist(), strict=True)))
-        actual, given = play.single(env, step), many.step(actions)
-        if not env.agents:
-            ends += 1
-            actual = play.single(env, env.reset())
-    assert ends > 1
-    assert 0 < np.mean(arrived) < 1
-
-
 def test_resetting_other_rows_keeps_delivered_messages(batch, play) -> None:
     """Also if the caller has overwritten returned observations."""
-    one, other = (
-        batch(3, SHIFT, seed=SEED, autoreset=False, exchanges=[Exchange(("arm_0", "arm_1", "arm_2"), LATE)] * 3)
-        for _ in range(2)
-    )
+    one, other = (batch(3, SHIFT, seed=SEED, autoreset=False, exchanges=[Exchange(ARMS, LATE)] * 3) for _ in range(2))
     for env in (one, other):
         env.reset()
     for _ in range(4):
@@ -315,37 +319,15 @@ def fleet(cell, plans) -> Fleet:
     return prepare(cell, difficulty="blind", cache=plans)
 
 
-def actions_of(play, mask: np.ndarray, step: int) -> np.ndarray:
-    """Return actions that do not depend on the number of rows."""
-    return play.chosen(mask, np.random.default_rng(step).random((1, 3, 2)))
-
-
 @pytest.mark.parametrize(
     ("difficulty", "e", "randomise"), [("blind", 0, None), ("oracle", 5, VARIED)], ids=["plain", "randomised"]
 )
 def test_a_row_equals_make_env_with_the_same_seed(cell, plans, play, e, difficulty, randomise) -> None:
     options: dict[str, Any] = {"difficulty": difficulty, "randomise": randomise, "cache": plans}
     batch, env = make_batch(cell, 6, LAST_SEED, **options), make_env(cell, **options)
-    obs, _ = batch.reset()
-    observed = play.single(env, env.reset(seed=LAST_SEED + e))
-    ends, faults = [], 0
-    for step in range(140):
-        play.same({n: v[e : e + 1] for n, v in obs.items()}, {n: observed[n] for n in obs})
-        actions = actions_of(play, obs["action_mask"], step)
-        given = batch.step(actions)
-        obs = given[0]
-        observed = play.single(env, env.step(dict(zip(env.possible_agents, actions[e].tolist(), strict=True))))
-        expected = play.rows(given, e)
-        play.same(
-            {n: v for n, v in observed.items() if n not in obs}, {n: expected[n] for n in observed if n not in obs}
-        )
-        faults += int(observed["faults"].sum())
-        if not env.agents:
-            ends.append(bool(observed["terminated"]))
-            play.same({n: expected[f"final_{n}"] for n in obs}, {n: observed[n] for n in obs})
-            observed = play.single(env, env.reset())
-    assert len(ends) >= 2
-    assert faults > 0
+    steps = list(both(batch, env, e, LAST_SEED + e, play, steps=140))
+    assert sum(bool(step["terminated"] | step["truncated"]) for step in steps) >= 2
+    assert sum(int(step["faults"].sum()) for step in steps) > 0
 
 
 @examples(25)
