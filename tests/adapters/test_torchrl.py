@@ -120,12 +120,6 @@ def test_a_seed_repeats_the_shifts_and_another_does_not(make) -> None:
     assert same(first, rolled(env, 40))
 
 
-def test_a_row_is_the_shift_of_its_own_seed(make) -> None:
-    there, alone = make(4, seed=20).reset(), make(1, seed=22).reset()
-    assert same(there[2:3], alone)
-    assert not same(there[1:2], alone)
-
-
 def test_without_a_seed_the_batch_keeps_its_own_and_none_is_another_each_time(make) -> None:
     unseeded = TorchRLEnv(make.batch(2, seed=9)).reset()
     assert same(unseeded, make(2, seed=9).reset())

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
@@ -143,6 +143,8 @@ def test_an_arm_that_begins_too_hot_faults_at_once(small) -> None:
 
 
 @settings(max_examples=12)
+@example(narrow=30.0, clear_s=33.0, dt_s=10.0, power_off=False)
+@example(narrow=30.0, clear_s=33.0, dt_s=10.0, power_off=True)
 @given(
     narrow=st.floats(0.02, 3.0), clear_s=st.floats(0.0, 25.0), dt_s=st.sampled_from([5.0, 10.0, 60.0]),
     power_off=st.booleans(),
@@ -153,12 +155,13 @@ def test_recovery_waits_for_every_motor_and_the_clearing_time(small, narrow, cle
         warning_c=75.0 - narrow / 2, error_c=75.0, restart_c=75.0 - narrow, clear_s=clear_s,
         power_off_on_fault=power_off,
     )  # fmt: skip
-    world, plant = hot_shop(small, limits=limits, dt_s=dt_s, ticks=round(900 / dt_s))
+    shift_s = 900.0 if narrow <= 3.0 else 3600.0
+    world, plant = hot_shop(small, limits=limits, dt_s=dt_s, ticks=round(shift_s / dt_s))
     log: list[Event] = []
     steps = work_on(world, plant, log)
     events = sorted((e for e in log if e.kind in ("fault", "recover")), key=lambda e: e.time_s)
     assert [e.kind for e in events] == ["fault", "recover"] * (len(events) // 2) + ["fault"] * (len(events) % 2)
-    assert len(events) > 2
+    assert len(events) >= 2
     for fault, recover in zip(events[::2], events[1::2], strict=False):
         assert recover.time_s >= fault.time_s + clear_s - 1e-6
     m, first = world.thermal, events[0]
@@ -169,11 +172,11 @@ def test_recovery_waits_for_every_motor_and_the_clearing_time(small, narrow, cle
     ).y[:, -1]  # fmt: skip
     braked = np.concatenate([np.zeros(7), np.zeros(7) if power_off else world.motors.idle_w[0]])
     cool = solve_ivp(
-        lambda _, x: (braked + m.to_ambient[0] * 25.0 - m.laplacian[0] @ x) / m.capacity[0], (0, 900), at_fault,
+        lambda _, x: (braked + m.to_ambient[0] * 25.0 - m.laplacian[0] @ x) / m.capacity[0], (0, shift_s), at_fault,
         rtol=1e-10, atol=1e-10, events=lambda _, x: x[WINDING].max() - limits.restart_c,
     )  # fmt: skip
     assert events[1].time_s == pytest.approx(first.time_s + cool.t_events[0][0] + clear_s, abs=0.01)
-    ends_s = [*(e.time_s for e in events[1::2]), 900.0]
+    ends_s = [*(e.time_s for e in events[1::2]), shift_s]
     lost_s = sum(end_s - fault.time_s for fault, end_s in zip(events[::2], ends_s, strict=False))
     assert steps[-1].state.lost_s[0, 0] == pytest.approx(lost_s, abs=1e-6)
 

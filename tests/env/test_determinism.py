@@ -88,7 +88,6 @@ def test_resets_without_a_seed_differ_and_follow_the_last_seed_and_zero_is_a_see
 
 
 def test_global_generators_are_neither_read_nor_changed(make, batch, play) -> None:
-    """An env neither uses nor changes NumPy's global generator."""
     results = []
     for seed in (1, 2):
         np.random.seed(seed)  # noqa: NPY002  # the global one is what this is about

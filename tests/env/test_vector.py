@@ -117,7 +117,9 @@ def both(
         assert expected["ended"][0] == (not env.agents)
         final = "" if env.agents else "final_"
         for n, values in observed.items():
-            np.testing.assert_allclose(values, expected[f"{final}{n}" if n in obs else n], rtol=rtol, err_msg=n)
+            row_values = expected[f"{final}{n}" if n in obs else n]
+            assert values.dtype == row_values.dtype, n
+            np.testing.assert_allclose(values, row_values, rtol=rtol, err_msg=n)
         yield observed
         if not env.agents:
             observed = play.single(env, env.reset())
