@@ -181,7 +181,7 @@ def test_a_batch_that_resets_by_itself_and_what_is_no_batch_are_refused(make) ->
     with pytest.raises(ValueError, match="autoreset=False"):
         TorchRLEnv(make.batch(2, autoreset=True))
     with pytest.raises(ValueError, match=r"TorchRLEnv takes a batch made by scenarios\.make_batch\(\) \(got "):
-        TorchRLEnv(None)
+        TorchRLEnv("quickstart")  # pyright: ignore[reportArgumentType]
 
 
 def masked(frames: TensorDict) -> TensorDict:

@@ -62,6 +62,7 @@ def test_a_packed_observation_is_read_back(arms, slots, plans, scaled, delivered
     for name, value in named.items():
         np.testing.assert_array_equal(getattr(again, name), value, err_msg=name)
     assert again.action_mask is mask
+    assert (np.frexp(layout.scales)[0] == 0.5).all()
     low, high = layout.bounds
     assert ((low <= vector) & (vector <= high)).all()
     assert layout.size == sum(int(np.prod(layout.shape(f))) for f in FIELDS)

@@ -63,8 +63,8 @@ def records() -> list[np.ndarray]:
 
 @pytest.fixture(scope="session")
 def small() -> TwinConfig:
-    """A configuration that trains seven joints in about two seconds."""
-    return TwinConfig(hidden=16, max_windows=384, epochs=40, batch=64, restarts=1)
+    """A configuration that trains seven joints in about a second."""
+    return TwinConfig(hidden=16, max_windows=384, epochs=25, batch=64, restarts=1)
 
 
 @pytest.fixture(scope="session")
