@@ -19,6 +19,7 @@ from fleet.errors import CheckpointError
 from fleet.motion import Phase
 from scenarios.prepare.twins import open_twin, save_twins
 from tests.profiles import examples
+from tests.twin.test_verdict import heavier
 from twin.baselines import untrained_config
 from twin.vae.config import TwinConfig
 from twin.vae.inference import Networks
@@ -206,20 +207,11 @@ def phase_errors(twin, plan):
 
 
 def test_more_torque_than_known_raises_the_score_of_that_joint_alone(twin, plan):
-    joint = 3
-
-    def heavier(phase: Phase) -> Phase:
-        profile = phase.profile.copy()
-        profile[:, 2, joint] *= 3
-        return Phase(profile, phase.payload_kg)
-
-    known = twin.score(plan, 10).per_joint
-    loaded_plan = replace(plan, **{name: heavier(getattr(plan, name)) for name in ("approach", "cycle", "retreat")})
-    rise = twin.score(loaded_plan, 10).per_joint - known
-    assert rise[joint] > 0.05
-    assert np.all(np.abs(np.delete(rise, joint)) < 1e-6)
-    loaded_shares, known_shares = (twin.measure(each, 10).shares for each in (loaded_plan, plan))
-    assert loaded_shares[joint, 2] > known_shares[joint, 2]
+    loaded = heavier(plan, 3, 3.0)
+    rise = twin.score(loaded, 10).per_joint - twin.score(plan, 10).per_joint
+    assert rise[3] > 0.05
+    assert np.all(np.abs(np.delete(rise, 3)) < 1e-6)
+    assert twin.measure(loaded, 10).shares[3, 2] > twin.measure(plan, 10).shares[3, 2]
 
 
 def test_the_job_error_is_the_mean_over_its_time(twin, plan):
@@ -271,12 +263,6 @@ def test_jobs_that_cannot_be_scored_are_refused(twin, plan):
             twin.score(plan, 1)
 
 
-@pytest.mark.parametrize("bad", [np.zeros((2, 9, 7, 3)), np.full((2, TwinConfig().window, 7, 3), np.nan)])
-def test_windows_that_do_not_fit_are_refused(twin, bad):
-    with pytest.raises(ValueError, match="Windows must be"):
-        twin.posterior(bad)[0]
-
-
 def test_window_errors_are_the_mean_distance_to_what_the_posterior_mean_decodes_to(twin, plan):
     windows = cut(resample(plan.cycle.profile, 50.0, 12.5), twin.config.window, 6)
     away = np.abs(windows - twin.reconstruct(windows)) / twin.scaler.std
@@ -290,6 +276,9 @@ def test_window_errors_are_the_mean_distance_to_what_the_posterior_mean_decodes_
 
 
 def test_what_does_not_belong_to_a_twin_is_refused(twin, plan):
+    for windows in (np.zeros((2, 9, 7, 3)), np.full((2, TwinConfig().window, 7, 3), np.nan)):
+        with pytest.raises(ValueError, match="Windows must be"):
+            twin.posterior(windows)
     with pytest.raises(ValueError, match="Each job needs its repetitions: 1 plans, 2 repetitions"):
         twin.features([plan], [1, 2])
     with pytest.raises(ValueError, match=r"scope 'arm' for 7 joints needs 1 network"):
