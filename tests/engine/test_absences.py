@@ -38,10 +38,10 @@ def test_an_arm_gives_its_job_back_after_the_cycle_in_which_a_break_begins(small
     assert steps[3].state.status[0, 0] == WAITING
 
 
-def test_an_arm_finishes_its_job_first_where_the_break_says_so(small) -> None:
-    log, _, world = shift(small, [(0, 3, 9, FINISH_JOB)], [[CLAIM]])
-    assert times(log, "finish") == [63.0]
-    assert times(log, "give_back") == []
+def test_an_arm_finishes_its_job_first_where_the_break_says_so_or_in_its_last_cycle(small) -> None:
+    for kind, repetitions in ((FINISH_JOB, 6), (FINISH_CYCLE, 3)):
+        log, _, _ = shift(small, [(0, 3, 9, kind)], [[CLAIM]], repetitions=repetitions)
+        assert (times(log, "finish"), times(log, "give_back")) == ([3.0 + 10.0 * repetitions], [])
     jobs = [[small.job("a"), small.job("b")]]
     log = []
     world, plant = small.shop(jobs, arms=1, absences=[(0, 3, 9, FINISH_JOB)])
@@ -79,11 +79,6 @@ def test_a_hot_arm_is_repaired_and_cool_before_it_goes_on(small) -> None:
     first, last = int(faults[0] // 10) + 2, int(cool[0] // 10)
     assert recoveries([(0, first, last - 1, BROKEN)]) == (faults, cool)
     assert recoveries([(0, first, last + 7, BROKEN)]) == (faults, [10.0 * (last + 7)])
-
-
-def test_an_arm_in_its_last_cycle_finishes_the_job(small) -> None:
-    log, _, _ = shift(small, [(0, 3, 6, FINISH_CYCLE)], [[CLAIM]], repetitions=3)
-    assert (times(log, "finish"), times(log, "give_back")) == ([33.0], [])
 
 
 def test_an_arm_on_its_way_to_the_first_cycle_goes_home(small) -> None:
