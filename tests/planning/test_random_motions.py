@@ -291,11 +291,11 @@ def test_the_tool_counts_and_an_arm_may_have_a_lower_limit():
 
 def test_a_load_that_is_carried_far_out_between_two_near_places_counts_there(planner):
     """The rating holds along the way, not only at the places: from 30° left to 30° right the tool stays as far out."""
-    near = place(0.6)
     turned = tuple(
-        Place(name=n, position_m=_turned(near.position_m, a), tool_deg=(0.0, 90.0, a))
-        for n, a in (("left", 30.0), ("right", -30.0))
-    )
+        replace(place(0.6), name=name, position_m=tuple(rotation((0.0, 0.0, deg)) @ place(0.6).position_m),
+                tool_deg=(0.0, 90.0, deg))
+        for name, deg in (("left", 30.0), ("right", -30.0))
+    )  # fmt: skip
     slow = Work(kind="pick_place", places=turned, payload_kg=3.5, dwell_s=130.0)
     with pytest.raises(InfeasibleJob, match="beyond the rating of 3"):
         planner.plan(slow)
@@ -312,9 +312,3 @@ def test_a_cached_plan_does_not_outlive_a_lower_limit(tmp_path):
 def test_a_heavier_tool_than_the_rating_is_refused():
     with pytest.raises(ValueError, match=r"Robot\.tool_kg must be at most 4\.5"):
         Robot(name="a", tool_kg=4.6)
-
-
-def _turned(position_m, degrees):
-    x, y, z = position_m
-    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
-    return (c * x - s * y, s * x + c * y, z)
