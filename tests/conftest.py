@@ -326,7 +326,6 @@ def small() -> SimpleNamespace:
         LIGHT=LIGHT,
         WARM=WARM,
         HOT=HOT,
-        PATH=__file__,
     )
 
 

@@ -21,16 +21,11 @@ from fleet.files import user_cache_folder
 
 PAGE = Path(__file__).parents[2] / "docs" / "trainers.md"
 ELSEWHERE = """
-import hashlib, importlib.util, sys
-loaded = []
-for name, path in zip(("small_worlds", "watched", "trainer"), sys.argv[1:]):
-    spec = importlib.util.spec_from_file_location(name, path)
-    module = sys.modules[name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    loaded.append(module)
-worlds, watched, trainer = loaded
-told = hashlib.sha256()
-for parameters in trainer.trained(watched.Workshop(worlds.Shifts(arms=3, jobs=8, ticks=15)), seed=0):
+import hashlib, importlib, sys
+from tests.adapters.conftest import Workshop
+from tests.conftest import Shifts
+told, trainer = hashlib.sha256(), importlib.import_module(f"tests.adapters.{sys.argv[1]}")
+for parameters in trainer.trained(Workshop(Shifts(arms=3, jobs=8, ticks=15)), seed=0):
     for name in sorted(parameters):
         told.update(name.encode() + parameters[name].tobytes())
 print("trained", told.hexdigest())
@@ -84,8 +79,6 @@ class Watched(BaseParallelWrapper[str, Any, Any]):
 
 @dataclass(frozen=True)
 class Workshop:
-    """Makes watched environments."""
-
     shifts: Callable[[Any], Any]
     name: str = field(default_factory=lambda: f"workshop {len(LOGS)}")
 
@@ -103,8 +96,6 @@ class Workshop:
 
 @dataclass(frozen=True)
 class Ending:
-    """How the shift of a workshop ends."""
-
     shift: dict[str, Any]
     """Its options."""
     finished: bool
@@ -117,8 +108,6 @@ FINISHED = Ending({"jobs": 1, "ticks": 400, "ambient_c": 20.0}, finished=True)
 
 @dataclass(frozen=True)
 class Turn:
-    """One step of an environment without a trainer."""
-
     before: dict[str, Any]
     """What the arms knew."""
     claims: dict[str, int]
@@ -152,14 +141,12 @@ def turns(
 
 
 def claim_by_chance(seed: int) -> Callable[[dict[str, Any]], dict[str, int]]:
-    """Any legal claim of each arm."""
     rng = np.random.default_rng(seed)
     return lambda seen: {arm: int(rng.choice(np.flatnonzero(each["action_mask"]))) for arm, each in seen.items()}
 
 
 @pytest.fixture(params=[CUT, FINISHED], ids=["cut", "finished"])
 def ending(request) -> Ending:
-    """Both ways in which a shift ends."""
     return request.param
 
 
@@ -201,12 +188,12 @@ def small_batch(small) -> Callable[..., BatchEnv]:
 
 
 @pytest.fixture(scope="session")
-def elsewhere(small) -> Callable[[str, int], str]:
+def elsewhere() -> Callable[[str, int], str]:
     """Trains with the `trained` of a test file in a process with this hash seed; gives the digest."""
 
     def train(file: str, hash_seed: int) -> str:
         ran = subprocess.run(
-            [sys.executable, "-c", ELSEWHERE, small.PATH, __file__, file],
+            [sys.executable, "-c", ELSEWHERE, Path(file).stem],
             env=os.environ | {"PYTHONHASHSEED": str(hash_seed), "PYTHONPATH": ":".join(p for p in sys.path if p)},
             capture_output=True, text=True, timeout=600, check=False,
         )  # fmt: skip

@@ -27,7 +27,6 @@ def parameters(agent) -> Parameters:
 
 
 def trained(workshop, seed: int, algorithm: str = "IPPO", masks: str = "list") -> tuple[Parameters, Parameters]:
-    """The actors' parameters before and after a training."""
     import torch
     from agilerl import algorithms
     from agilerl.components.replay_buffer import ReplayBuffer
@@ -58,7 +57,6 @@ def trained(workshop, seed: int, algorithm: str = "IPPO", masks: str = "list") -
 
 @pytest.fixture(scope="module", params=[("IPPO", "list"), ("MADDPG", "list"), ("MATD3", "array")], ids="-".join)
 def session(request, small_workshop):
-    """A training, what it left, and what reached the environments."""
     workshop = small_workshop()
     return workshop.log, *trained(workshop, 0, *request.param)
 

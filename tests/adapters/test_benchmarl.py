@@ -25,7 +25,6 @@ pytestmark = [
 
 
 def trained(workshop, seed: int, algorithm: str = "Mappo") -> tuple[Parameters, Parameters]:
-    """The policy's parameters before and after two iterations."""
     import benchmarl.algorithms
     from benchmarl.experiment import Experiment, ExperimentConfig
     from benchmarl.models.mlp import MlpConfig
@@ -58,7 +57,6 @@ def trained(workshop, seed: int, algorithm: str = "Mappo") -> tuple[Parameters, 
 
 @pytest.fixture(scope="module", params=["Mappo", "Qmix"])
 def session(request, small_workshop):
-    """A training, what it left, and what reached the environments."""
     workshop = small_workshop()
     return workshop.log, *trained(workshop, 0, request.param)
 

@@ -96,7 +96,6 @@ def test_other_files_of_a_policy_are_refused(cluster, study, tmp_path, monkeypat
 
 @pytest.fixture(scope="module")
 def node(cluster):
-    """One more node."""
     return cluster.add_node(num_cpus=1)
 
 

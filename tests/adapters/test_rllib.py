@@ -39,7 +39,6 @@ def built(workshop, seed: int):
 
 
 def trained(workshop, seed: int) -> tuple[Parameters, Parameters]:
-    """The policy's parameters before and after two iterations."""
     algo = built(workshop, seed)
     before = parameters(algo)
     for _ in range(2):
@@ -70,7 +69,6 @@ def swept() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def session(small_workshop):
-    """A training, what it left, and what reached the environments."""
     workshop = small_workshop()
     return workshop.log, *trained(workshop, seed=0)
 

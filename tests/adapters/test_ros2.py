@@ -47,7 +47,6 @@ def joint_states(draw):
 
 
 def fields(message):
-    """Content of a JointState of rclpy."""
     stamp = message.header.stamp
     lists = (tuple(values) for values in (message.position, message.velocity, message.effort))
     return Joints(stamp.sec + stamp.nanosec / 1e9, tuple(message.name), *lists)
@@ -223,7 +222,6 @@ class Shop:
                 self.executor.spin_once(timeout_sec=0.0)
 
     def send(self, goal):
-        """Send a goal and wait until it is accepted."""
         self.until(self.client.server_is_ready)
         asked = self.client.send_goal_async(goal, lambda message: self.feedback.append(message.feedback))
         self.until(asked.done)

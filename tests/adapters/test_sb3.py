@@ -37,7 +37,6 @@ class Watch:
 
 
 def trained(workshop, seed: int, *, observation: str = "vector", algo: str = "MaskablePPO", extra: int = 0):
-    """The policy's parameters before and after a training of three iterations."""
     import torch
     from sb3_contrib import MaskablePPO
     from stable_baselines3 import PPO
@@ -58,7 +57,6 @@ def trained(workshop, seed: int, *, observation: str = "vector", algo: str = "Ma
 
 @pytest.fixture(scope="module", params=["vector", "dict"])
 def session(request, small_workshop):
-    """A training, what it left, and what reached the batch."""
     workshop = small_workshop(**MANY)
     return workshop.log, request.param, *trained(workshop, seed=0, observation=request.param), trained.agent
 

@@ -15,7 +15,6 @@ pytestmark = pytest.mark.adapter
 
 
 def trained(workshop, seed: int) -> tuple[Parameters, Parameters]:
-    """The network's parameters before and after a training of two epochs."""
     import torch
     from tianshou.algorithm import DQN
     from tianshou.algorithm.modelfree.dqn import DiscreteQLearningPolicy
@@ -62,7 +61,6 @@ def trained(workshop, seed: int) -> tuple[Parameters, Parameters]:
 
 @pytest.fixture(scope="module")
 def session(small_workshop):
-    """A training, what it left, and what reached the environments."""
     workshop = small_workshop()
     return workshop.log, *trained(workshop, seed=0)
 

@@ -7,7 +7,6 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import PettingZooWrapper, RewardSum, TransformedEnv, check_env_specs
 from torchrl.modules import MaskedCategorical
-from torchrl.objectives.value import GAE
 
 from fleet.engine.batch import TERMS
 from fleet.env.adapters.torchrl import TorchRLEnv
@@ -44,8 +43,9 @@ def same(one: TensorDict, two: TensorDict) -> bool:
     return bool((one == two).all())
 
 
-@pytest.mark.parametrize("switches", [{}, {"state": True}, {"infos": True}, {"joined": False, "state": True}], ids=str)
-@pytest.mark.parametrize("envs", [1, 4])
+@pytest.mark.parametrize(
+    ("envs", "switches"), [(1, {"infos": True}), (4, {}), (4, {"joined": False, "state": True})], ids=str
+)
 def test_torchrl_finds_the_specs_kept(make, envs, switches) -> None:
     check_env_specs(make(envs, **switches))
     check_env_specs(make(envs, **switches), break_when_any_done=False)
@@ -58,13 +58,12 @@ def test_the_parts_of_an_observation_joined_are_its_vectors(make) -> None:
     assert torch.equal(parts["arms", "action"], whole["arms", "action"])
 
 
-@pytest.mark.parametrize("shift", [{"hard_due": 0.0}, BRIEF], ids=["cut", "brief"])
+@pytest.mark.parametrize("shift", [{"hard_due": 0.0, "ambient_c": 58.0}, BRIEF], ids=["cut", "brief"])
 def test_a_rollout_is_the_batch_stepped_by_hand(make, shift) -> None:
     """The second way: a batch that begins new shifts by itself, given the same claims."""
     frames = rolled(make(6, seed=11, state=True, infos=True, **shift), 70)
     batch = make.batch(6, autoreset=True, **shift)
     obs = batch.joined(batch.reset(seed=11)[0])
-    ends = 0
     for at in range(70):
         now, after = frames[:, at], frames["next"][:, at]
         np.testing.assert_array_equal(now["arms", "observation"], obs["observation"])
@@ -81,37 +80,21 @@ def test_a_rollout_is_the_batch_stepped_by_hand(make, shift) -> None:
         np.testing.assert_array_equal(after["terminated"][:, 0], terminated)
         np.testing.assert_array_equal(after["truncated"][:, 0], truncated)
         np.testing.assert_array_equal(after["done"][:, 0], terminated | truncated)
-        ends += int(after["done"].sum())
-    assert ends >= 6
-    assert bool(frames["next", "terminated"].any()) == (shift is BRIEF)
-    assert bool(frames["next", "truncated"].any()) == (shift is not BRIEF)
-
-
-def test_infos_are_those_of_the_batch(make) -> None:
-    frames = rolled(make(4, seed=2, infos=True, jobs=60, ticks=60), 55)
-    batch = make.batch(4, jobs=60, ticks=60)
-    batch.reset(seed=2)
-    for at in range(55):
-        *_, info = batch.step(frames["arms", "action"][:, at].numpy())
-        told, team = frames["next", "arms", "info"][:, at], frames["next", "info"][:, at]
         for name in ("faults", "illegal", "peak_c", "above_warning_s"):
-            np.testing.assert_array_equal(told[name][..., 0], np.float32(info[name]))
+            np.testing.assert_array_equal(after["arms", "info", name][..., 0], np.float32(info[name]))
         for name in ("jobs_done", "elapsed_s"):
-            np.testing.assert_array_equal(team[name][:, 0], info[name])
+            np.testing.assert_array_equal(after["info", name][:, 0], info[name])
         each = np.repeat(info["elapsed_s"][:, None], ARMS, axis=1)
-        np.testing.assert_array_equal(frames["next", "arms", "elapsed_s"][:, at, :, 0], each)
+        np.testing.assert_array_equal(after["arms", "elapsed_s"][..., 0], each)
     terms = sum(frames["next", "info", f"reward_{term}"] for term in TERMS)
     np.testing.assert_allclose(terms, frames["next", "arms", "reward"][:, :, 0], rtol=1e-5, atol=1e-5)
-    assert frames["next", "info", "jobs_done"].max() > 0
-    assert frames["next", "arms", "info", "above_warning_s"].max() > 0
-
-
-def test_random_rollouts_send_no_illegal_action(make) -> None:
-    frames = rolled(make(16, infos=True), 60)
-    chosen = frames["arms", "action_mask"].gather(-1, frames["arms", "action"][..., None])
-    assert chosen.all()
-    assert (frames["arms", "action"] > 0).sum() > 100
+    assert (frames["arms", "action"] > 0).sum() > 20
     assert frames["next", "arms", "info", "illegal"].max() == 0
+    assert frames["next", "done"].sum() >= 6
+    assert bool(frames["next", "terminated"].any()) == (shift is BRIEF)
+    assert bool(frames["next", "truncated"].any()) == (shift is not BRIEF)
+    assert frames["next", "info", "jobs_done"].max() > 0
+    assert bool((frames["next", "arms", "info", "above_warning_s"] > 0).any()) == (shift is not BRIEF)
 
 
 def test_what_is_sent_against_the_mask_waits_and_is_counted(make) -> None:
@@ -122,14 +105,6 @@ def test_what_is_sent_against_the_mask_waits_and_is_counted(make) -> None:
         (2, ARMS), env.layout.actions - 2
     )  # only the first two slots can hold a job so early
     assert (env.step(seen)["next", "arms", "info", "illegal"] == 1).all()
-
-
-def test_a_rollout_into_old_frames_is_a_rollout(make) -> None:
-    frames = rolled(make(4, seed=0), 20)
-    old = rolled(make(4, seed=1), 20)
-    torch.manual_seed(0)
-    assert same(make(4, seed=0).rollout(20, break_when_any_done=False, out=old), frames)
-    assert same(old, frames)
 
 
 def test_a_seed_repeats_the_shifts_and_another_does_not(make) -> None:
@@ -143,12 +118,6 @@ def test_a_seed_repeats_the_shifts_and_another_does_not(make) -> None:
     assert not same(first, rolled(env, 40))  # the next shifts, not the same again
     assert env.set_seed(0, static_seed=True) == 0
     assert same(first, rolled(env, 40))
-
-
-def test_a_row_is_the_shift_of_its_own_seed(make) -> None:
-    there, alone = make(4, seed=20).reset(), make(1, seed=22).reset()
-    assert same(there[2:3], alone)
-    assert not same(there[1:2], alone)
 
 
 def test_without_a_seed_the_batch_keeps_its_own_and_none_is_another_each_time(make) -> None:
@@ -208,15 +177,11 @@ def test_a_step_after_the_end_says_what_to_call(make) -> None:
         env.step(env.rand_action(env.step_mdp(last)))
 
 
-def test_a_batch_that_resets_by_itself_is_refused(make) -> None:
+def test_a_batch_that_resets_by_itself_and_what_is_no_batch_are_refused(make) -> None:
     with pytest.raises(ValueError, match="autoreset=False"):
         TorchRLEnv(make.batch(2, autoreset=True))
-
-
-def test_what_is_no_batch_is_refused(small_workshop) -> None:
-    for wrong in (None, "quickstart", small_workshop()()):
-        with pytest.raises(ValueError, match=r"TorchRLEnv takes a batch made by scenarios\.make_batch\(\) \(got "):
-            TorchRLEnv(wrong)
+    with pytest.raises(ValueError, match=r"TorchRLEnv takes a batch made by scenarios\.make_batch\(\) \(got "):
+        TorchRLEnv("quickstart")  # pyright: ignore[reportArgumentType]
 
 
 def masked(frames: TensorDict) -> TensorDict:
@@ -266,21 +231,6 @@ def test_the_example_of_the_page_discounts_by_elapsed_time(example) -> None:
         td = each["reward"][now] + gamma[now] * (1 - terminated[now]) * after[now] - value[now]
         advantage = td + 0.95 * gamma[now] * (1 - done[now]) * advantage
         torch.testing.assert_close(frames["advantage"][now].double(), advantage, rtol=1e-3, atol=1e-2)
-
-
-def test_other_losses_take_the_expanded_flags(example) -> None:
-    """GAE needs flags in the shape of the reward, as the page says."""
-    told = example("TorchRL")
-    frames, keys = told["frames"], {"value": told["value"], "reward": ("arms", "reward")}
-    plain = GAE(gamma=0.99, lmbda=0.95, value_network=told["critic"])
-    plain.set_keys(**keys)
-    with pytest.raises(RuntimeError, match="must share a unique shape"):
-        plain(frames.clone())
-    for flag in ("done", "terminated"):
-        frames["next", "arms", flag] = frames["next", flag].unsqueeze(-2).expand_as(frames["next", "arms", "reward"])
-    plain.set_keys(**keys, done=("arms", "done"), terminated=("arms", "terminated"))
-    plain(frames)
-    assert frames["advantage"].shape == frames["next", "arms", "reward"].shape
 
 
 @pytest.mark.parametrize("mask_in", ["obs", "info"])

@@ -8,7 +8,6 @@ Parameters = dict[str, np.ndarray]
 
 
 def parameters(module: Any) -> Parameters:
-    """Copies of the parameters of a network of torch."""
     return {name: value.detach().numpy().copy() for name, value in module.named_parameters()}
 
 

@@ -98,6 +98,5 @@ def drawn(rng: np.random.Generator) -> Observation:
 
 
 def of_arms(seen: Observation) -> dict[str, Observation]:
-    """The observation of each arm."""
     names = [*(field.name for field in FIELDS), "peers", "action_mask"]
     return {f"arm{a}": Observation(**{name: getattr(seen, name)[a] for name in names}) for a in range(5)}

@@ -50,27 +50,11 @@ def test_no_policy_by_worth_claims_a_job_that_would_end_100_min_late(name: str, 
     assert (action(name, late) != WAIT) == claims
 
 
-def test_a_sure_fault_costs_the_job_and_the_price() -> None:
-    assert action("wsept", seen([4.0], [95.0, 95.0])) == WAIT
-    assert action("wsept", seen([4.0], [50.0, 50.0])) == 1
-
-
 def test_of_two_plans_the_cool_one_is_taken_only_where_the_fast_one_would_fault() -> None:
     assert action("wsept", seen([4.0], [55.0, 50.0])) == 1
     assert action("wsept", seen([4.0], [85.0, 50.0])) == 2
     # At the error limit half of the fast trials fault: 0.5 · 4 − 0.5 · price < 0, and the slow plan is worth 4.
     assert action("wsept", seen([4.0], [75.0, 50.0])) == 2
-
-
-def test_a_claim_of_positive_worth_is_made_and_its_worth_is_the_expectation() -> None:
-    """A mean peak two deviations below the error limit faults with 2.3 %; the time above 60 °C is (70 − 60) / 30 K."""
-    peak_c = 75.0 + Wsept.margin_k - 2.0 * Wsept.peak_sd_k
-    assert peak_c == 70.0
-    heat = 0.0227501 * (1.0 + Wsept.fault_price) + 0.05 * (10.0 / 30.0) * FAST / 60.0
-    rates = -Wsept().cost(one_fleet([seen([1.0], [peak_c, 95.0])]))[0, 0]
-    assert rates[0] == pytest.approx((1.0 - heat) / FAST, rel=1e-4)
-    assert action("wsept", seen([heat * 1.01], [peak_c, 95.0])) == 1
-    assert action("wsept", seen([heat * 0.9], [peak_c, 95.0])) == WAIT
 
 
 @pytest.mark.parametrize(
@@ -278,7 +262,7 @@ def test_a_rule_in_a_wrapper_keeps_its_scope_and_is_legal_all_shift(small, wrapp
     policy = policy_of(full)
     assert scope_of(full) == scope_of(name) == policy.scope
     assert label(full) == full
-    env = parallel_env(small.Shifts(arms=2, jobs=8, ticks=100, ambient_c=38.0))
+    env = parallel_env(small.Shifts(arms=2, jobs=8, ticks=50, ambient_c=38.0))
     env.reset(seed=1)
     policy.reset(np.random.default_rng(1))
     while env.agents:

@@ -164,7 +164,7 @@ def weights(of: Trainer) -> dict[str, torch.Tensor]:
 @pytest.mark.parametrize("algorithm", [pytest.param("mappo", marks=pytest.mark.slow), "ippo"])
 def test_it_learns_what_is_worth_more(small, algorithm, decisions) -> None:
     learner = trainer(small, algorithm=algorithm, decisions=decisions, learning_rate=3e-3, seed=1)
-    told = list(islice(learner.iterate(), 25))
+    told = list(islice(learner.iterate(), 15))
     rewards = [each.reward for each in told]
     if decisions == "interval":
         assert {each.hours for each in told} == {8 * 30 * 10 / 3600}

@@ -164,7 +164,7 @@ def played(world, policy, *, seed=0, weights=WEIGHTS):
 
 
 @pytest.mark.ci_slow
-@settings(max_examples=15)
+@settings(max_examples=6)
 @given(seed=st.integers(0, 10_000), hot=st.booleans(), moment=st.sampled_from([50.0, 100.0]))
 def test_no_job_before_its_release_changes_a_claim(small, seed, hot, moment):
     shifts = small.Shifts(arms=3, jobs=10, ticks=40, limits=HOT if hot else ThermalLimits(), crowding=0.3)

@@ -74,23 +74,22 @@ ALONE = [name for name, rule in RULES.items() if not rule.plans]
 @pytest.mark.parametrize("arms", [1, 3])
 def test_every_rule_plays_a_shift_legally_and_repeats_it_also_from_event_to_event(small, name, arms) -> None:
     """A rule that reads which claims were lost sees them at once, also where a step lasts until the next choice."""
-    shifts = small.Shifts(arms=arms, jobs=12, ticks=120, ambient_c=38.0, crowding=0.3)
+    shifts = small.Shifts(arms=arms, jobs=12, ticks=90, ambient_c=38.0, crowding=0.3)
     finished_s = []
     for decisions in ("interval", "interval", "events"):
         env, policy = parallel_env(shifts, decisions=decisions, bids=True), make_policy(name)
-        for seed in range(2):
-            env.reset(seed=seed)
-            policy.reset(rng(seed))
-            while env.agents:
-                actions = policy.act(env.knowledge())
-                assert list(actions) == env.possible_agents
-                assert all(type(action) is int for action in actions.values())
-                env.step(actions)
-            assert env.truth.illegal.sum() == 0
-            # Two rules claim little in such ambient temperature.
-            assert (env.truth.status == 2).sum() > (0 if name in ("wspt_cool", "thermometer") else 2)
-            finished_s.append(env.truth.finished_s)
-    np.testing.assert_array_equal(finished_s[:4], finished_s[2:])
+        env.reset(seed=0)
+        policy.reset(rng())
+        while env.agents:
+            actions = policy.act(env.knowledge())
+            assert list(actions) == env.possible_agents
+            assert all(type(action) is int for action in actions.values())
+            env.step(actions)
+        assert env.truth.illegal.sum() == 0
+        # Two rules claim little in such ambient temperature.
+        assert (env.truth.status == 2).sum() > (0 if name in ("wspt_cool", "thermometer") else 2)
+        finished_s.append(env.truth.finished_s)
+    np.testing.assert_array_equal(finished_s[:2], finished_s[1:])
 
 
 @pytest.mark.parametrize("name", RULES)
@@ -121,11 +120,6 @@ def test_every_rule_lets_a_single_free_arm_work(name) -> None:
     assert second != WAIT
 
 
-def test_an_unknown_rule_names_the_nearest() -> None:
-    with pytest.raises(ValueError, match="No policy 'coolest'; did you mean 'coolest_first'"):
-        make_policy("coolest")
-
-
 @pytest.mark.parametrize("name", ALONE)
 def test_fleets_side_by_side_get_the_actions_of_each_alone(name) -> None:
     draw = rng(1)
@@ -137,7 +131,7 @@ def test_fleets_side_by_side_get_the_actions_of_each_alone(name) -> None:
     if decide is None:
         assert name == "rolling_horizon"
         return
-    for _ in range(20):
+    for _ in range(12):
         envs = np.flatnonzero(draw.random(4) < 0.7)
         fleets = [
             fleet(np.where(draw.random((3, 5)) < 0.3, np.nan, draw.integers(0, 4, (3, 5))).tolist(),
@@ -153,14 +147,11 @@ def test_fleets_side_by_side_get_the_actions_of_each_alone(name) -> None:
         assert decide(envs, Observation(**stacked)).tolist() == expected
 
 
-def test_round_robin_rotates() -> None:
+def test_round_robin_rotates_and_passes_over_whom_it_cannot_ask() -> None:
     one_job = fleet([[1.0]] * 3)
     assert act("round_robin", *[one_job] * 4) == [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0]]
     # Two jobs, oldest first: arms 0 and 1, then 2 and 0.
     assert act("round_robin", *[fleet([[1.0, 1.0]] * 3)] * 2) == [[1, 2, 0], [2, 0, 1]]
-
-
-def test_round_robin_passes_over_whom_it_cannot_ask() -> None:
     busy = fleet([[1.0]] * 3, free=[0, 1, 1])
     unable = fleet([[1.0]] * 3, feasible=[[1], [1], [0]])
     assert act("round_robin", busy, unable, fleet([[1.0]] * 3)) == [[0, 1, 0], [1, 0, 0], [0, 1, 0]]
@@ -182,8 +173,7 @@ def test_random_is_uniform_over_what_is_legal() -> None:
     assert stats.chisquare(counts[[1, 3, 4]]).pvalue > 0.01
 
 
-def test_least_difficulty_leaves_nothing_to_who_is_at_work_and_waits_for_no_station() -> None:
-    assert act("least_difficulty", fleet([[2.0], [1.0]], free=[1, 0])) == [[1, 0]]
+def test_least_difficulty_waits_for_no_station() -> None:
     # The older job is easiest for arm 0, but its station is busy.
     assert act("least_difficulty", fleet([[0.1, 2.0], [0.2, 3.0]], mask=[[0, 1], [0, 1]])) == [[2, 0]]
 
@@ -303,7 +293,6 @@ def queue(duration_s, due_s, value, now_s: float = 0.0, **fields) -> Observation
 
 
 def sequence(name: str, duration_s, due_s, value) -> list[int]:
-    """Jobs in the order in which one arm does them by a rule."""
     policy, left, done, now_s = make_policy(name), list(range(len(duration_s))), [], 0.0
     while left:
         durations, dues, values = ([row[job] for job in left] for row in (duration_s, due_s, value))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from agents import staleness
 from agents.rules import LeastDifficulty
-from agents.staleness import advantage, fading_weights
+from agents.staleness import advantage
 from fleet.observation import Observation
 from tests.agents.observations import observation, with_peers
 
@@ -38,14 +38,7 @@ def scales(**seconds: float) -> Iterator[None]:
 
 
 def choice(observation: Observation) -> int:
-    """The first arm's claim."""
     return LeastDifficulty().choose(observation, 0)
-
-
-def test_a_word_counts_for_one_part_in_e_after_the_time_in_which_it_fades():
-    seen = heard([0.0], [[0.0]] * 3, [0.0, 30.0, 60.0])
-    with scales(FADING_S=30.0):
-        np.testing.assert_allclose(fading_weights(seen), [1.0, 1 / math.e, 1 / math.e**2])
 
 
 def test_advantage_is_against_the_average_by_weight_and_fades_with_it():

@@ -1,7 +1,5 @@
 """Breaks and failures of arms: what becomes of their jobs, by the phases (approach 3 s, cycle 10 s, retreat 2 s)."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -40,10 +38,10 @@ def test_an_arm_gives_its_job_back_after_the_cycle_in_which_a_break_begins(small
     assert steps[3].state.status[0, 0] == WAITING
 
 
-def test_an_arm_finishes_its_job_first_where_the_break_says_so(small) -> None:
-    log, _, world = shift(small, [(0, 3, 9, FINISH_JOB)], [[CLAIM]])
-    assert times(log, "finish") == [63.0]
-    assert times(log, "give_back") == []
+def test_an_arm_finishes_its_job_first_where_the_break_says_so_or_in_its_last_cycle(small) -> None:
+    for kind, repetitions in ((FINISH_JOB, 6), (FINISH_CYCLE, 3)):
+        log, _, _ = shift(small, [(0, 3, 9, kind)], [[CLAIM]], repetitions=repetitions)
+        assert (times(log, "finish"), times(log, "give_back")) == ([3.0 + 10.0 * repetitions], [])
     jobs = [[small.job("a"), small.job("b")]]
     log = []
     world, plant = small.shop(jobs, arms=1, absences=[(0, 3, 9, FINISH_JOB)])
@@ -81,11 +79,6 @@ def test_a_hot_arm_is_repaired_and_cool_before_it_goes_on(small) -> None:
     first, last = int(faults[0] // 10) + 2, int(cool[0] // 10)
     assert recoveries([(0, first, last - 1, BROKEN)]) == (faults, cool)
     assert recoveries([(0, first, last + 7, BROKEN)]) == (faults, [10.0 * (last + 7)])
-
-
-def test_an_arm_in_its_last_cycle_finishes_the_job(small) -> None:
-    log, _, _ = shift(small, [(0, 3, 6, FINISH_CYCLE)], [[CLAIM]], repetitions=3)
-    assert (times(log, "finish"), times(log, "give_back")) == ([33.0], [])
 
 
 def test_an_arm_on_its_way_to_the_first_cycle_goes_home(small) -> None:
@@ -138,19 +131,3 @@ def test_a_simulator_for_policies_knows_breaks_and_no_future_failures(small) -> 
     simulator.look(runner.engine, 0, seen)
     known = simulator._engine.state.absences[0]
     assert [each for each in known.tolist() if each[3]] == [(0, 5, 9, FINISH_JOB), (0, 0, 2, BROKEN)]
-
-
-def test_without_absences_nothing_changes(small) -> None:
-    make = small.Shifts(arms=3, jobs=9, ticks=60, ambient_c=45.0)
-    episode = make(np.random.SeedSequence(3))
-    (shift,) = episode.world.shifts
-    never = np.array([(0, 10**6, 10**6 + 1, BROKEN)], shift.absences.dtype)
-    late = replace(episode.world, shifts=(replace(shift, absences=never),))
-    results = []
-    for world in (episode.world, late):
-        runner, rng = Single(replace(episode, world=world)), np.random.default_rng(3)
-        outcomes = []
-        while runner.tick < world.ticks:
-            outcomes.append(runner.step(np.array([rng.choice(np.flatnonzero(mask)) for mask in runner.mask])).tolist())
-        results.append((outcomes, runner.state.temp_c.tolist(), runner.state.mode.tolist()))
-    assert results[0] == results[1]

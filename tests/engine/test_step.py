@@ -7,13 +7,11 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from fleet.engine import tables
-from fleet.engine.shift import events_of, initial
-from fleet.engine.tables import event_buffer, record_event
+from fleet.engine.shift import initial
 from fleet.engine.world import World
 from fleet.events import Event
-from fleet.heat.motor import gen3_motors, thermal_data
-from fleet.heat.thermal import WINDING, gen3_network, thermal_model
+from fleet.heat.motor import thermal_data
+from fleet.heat.thermal import gen3_network, thermal_model
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import IDLE
 from tests.engine.play import DT_S, play, times
@@ -53,24 +51,6 @@ def test_an_arm_that_is_home_at_the_end_of_a_step_is_free_in_the_next(small) -> 
     spans = small.Times(0.1, 0.1, 9.6)
     world, plant = small.shop([[small.job("a", content)]], arms=[small.arm(0, [content], times=spans)], ticks=2)
     assert play(world, plant, [[1]])[0].state.mode[0, 0] == IDLE
-
-
-NAMES = (
-    "award", "lost", "illegal", "warning", "finish", "home", "fault", "return", "give_up", "recover", "moved",
-    "give_back", "expire", "failure", "break", "break_end",
-)  # fmt: skip
-
-
-def test_every_event_that_the_engine_records_has_its_name_and_a_kept_job_its_cycles(small) -> None:
-    world, plant = small.shop([[small.job("a", repetitions=6)]], arms=1)
-    state, buffer = play(world, plant, [[1]])[0].state, event_buffer(1)
-    state.cycles[0, 0] = 2
-    for name in NAMES:
-        buffer.used[0] = 0
-        record_event(buffer, getattr(tables, name.upper()), 0, 0, 0, 0, 1.0, 2.0)
-        event = next(iter(events_of(world, state, buffer)))
-        assert event.kind == name
-        assert (event.reason == "2 of 6 cycles kept") == (name in ("return", "give_back"))
 
 
 def test_a_release_is_an_event_at_its_time(small) -> None:
@@ -142,18 +122,6 @@ def test_a_long_job_follows_the_heat_law_integrated_by_scipy(small) -> None:
     assert got == pytest.approx(law.y[:, -1], abs=0.15)  # the loss lags by a step
 
 
-def test_temperatures_converge_with_the_step_size(small) -> None:
-    content = small.work(payload_kg=small.WARM)
-    ends = []
-    for dt_s in (10.0, 5.0, 1.0):
-        world, plant = small.shop([[small.job("a", content, repetitions=200)]], dt_s=dt_s, ticks=round(600 / dt_s))
-        ends.append(play(world, plant, [[1, 0]])[-1].state.temp_c)
-    coarse, middle, fine = ends
-    assert np.abs(coarse - fine).max() < 0.2
-    # First order: the error is proportional to the step. Against 1 s, e(10) : e(5) = 9 : 4.
-    assert np.abs(coarse - fine).max() / np.abs(middle - fine).max() == pytest.approx(9 / 4, rel=0.1)
-
-
 def test_an_idle_warm_fleet_is_in_steady_state(small) -> None:
     content = small.work()
     world, plant = small.shop([[]], arms=[small.arm(0, [content])], ticks=60, start_warm=True)
@@ -190,9 +158,3 @@ def heated(world: World, a: int, start_c, heat_w, seconds: float) -> tuple[np.nd
     law[n : 2 * n, :n] = np.eye(n)
     end = expm(law * seconds) @ np.concatenate([start_c - 25.0, np.zeros(n), [1.0]])
     return end[:n] + 25.0, end[n : 2 * n]
-
-
-def test_the_motors_of_a_standing_arm_are_nominal(small) -> None:
-    """The arms have the parameters that `rhs` reads from the data file."""
-    assert gen3_motors().copper_w_per_a2.tolist() == thermal_data()["copper_w_per_a2"]
-    assert small.arm(0, [small.work()]).thermal.capacity[WINDING].tolist() == thermal_data()["winding_j_per_k"]

@@ -16,8 +16,6 @@ PLACES = ("bench", "press", "rack")
 
 @dataclass(frozen=True)
 class Draft:
-    """A random scenario."""
-
     works: tuple[tuple[str, str | None, float], ...]
     """From, to (None for a hold), kg."""
     able: tuple[frozenset[int], ...]
@@ -66,7 +64,6 @@ def drafts(draw: Any) -> Draft:
 
 
 def world_of(small: Any, draft: Draft) -> tuple[World, ProfilePlant]:
-    """Return the world of a draft, and its plant."""
     works = [small.work(place, kg, to=to) for place, to, kg in draft.works]
     arms = [
         small.arm(i, [works[w] for w in sorted(able)], times=small.Times(3.0 + i, 7.0 + 2 * i, 2.0))

@@ -16,25 +16,14 @@ from fleet.telemetry import WORKING
 # End of an episode
 
 
-@pytest.mark.parametrize("jobs", [0, 8])
-def test_all_arms_end_at_the_horizon(make, jobs) -> None:
-    env = make({"ticks": 12, "jobs": jobs})
+def test_all_arms_end_at_the_horizon_also_without_jobs(make) -> None:
+    env = make({"ticks": 12, "jobs": 0})
     env.reset(seed=1)
     ends = [env.step(dict.fromkeys(env.possible_agents, 0)) for _ in range(12)]
     assert [(set(t.values()), set(u.values())) for _, _, t, u, _ in ends] == [({False}, {False})] * 11 + [
         ({False}, {True})
     ]
     assert env.agents == []
-
-
-def test_an_episode_ends_when_all_jobs_are_done(make, small, play) -> None:
-    env = make({"arms": 2, "jobs": 1, "ticks": 400, "ambient_c": 20.0})
-    env.reset(seed=2)
-    trace = play.go_on(env, np.random.default_rng(2))
-    assert set(trace[-1][2].values()) == {True}
-    assert set(trace[-1][3].values()) == {False}
-    assert trace[-1][4]["arm_0"]["jobs_done"] == 1.0
-    assert env.world.shifts[0].due_s[0] < env.world.horizon_s
 
 
 def test_jobs_done_in_the_last_step_terminate_and_do_not_truncate(make, play) -> None:
@@ -45,16 +34,9 @@ def test_jobs_done_in_the_last_step_terminate_and_do_not_truncate(make, play) ->
         return len(trace), trace[-1][2]["arm_0"], trace[-1][3]["arm_0"]
 
     steps, *_ = last()
+    assert steps < 400
     assert last() == last(steps) == (steps, True, False)
     assert last(steps - 1) == (steps - 1, False, True)
-
-
-def test_the_fleet_is_rendered_as_text(make) -> None:
-    env = make(render_mode="ansi")
-    env.reset(seed=0)
-    lines = (env.render() or "").splitlines()
-    assert [line.split()[:2] for line in lines[1:]] == [[f"arm_{i}", "idle"] for i in range(3)]
-    assert make().render() is None
 
 
 def test_watcher_and_event_log_record_every_step(make, play) -> None:
@@ -109,13 +91,12 @@ def test_an_idle_step_costs_only_its_energy(small) -> None:
     assert terms["energy"].sum() == pytest.approx(-0.5 * watts * 60.0 / 3600.0, rel=1e-3)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_the_rewards_of_an_episode_add_up_to_the_event_log(small, seed) -> None:
+def test_the_rewards_of_an_episode_add_up_to_the_event_log(small) -> None:
     limits = ThermalLimits(warning_c=45.0, error_c=50.0, restart_c=42.0)
     weights = RewardWeights(tardiness=-0.1)
     env = parallel_env(small.Shifts(jobs=15, ticks=100, limits=limits), weights=weights, keep_events=True)
-    env.reset(seed=seed)
-    rng, got = np.random.default_rng(seed), dict.fromkeys(TERMS, 0.0)
+    env.reset(seed=0)
+    rng, got = np.random.default_rng(0), dict.fromkeys(TERMS, 0.0)
     total = 0.0
     while env.agents:
         _, rewards, *_, infos = env.step(
@@ -141,27 +122,18 @@ def test_the_rewards_of_an_episode_add_up_to_the_event_log(small, seed) -> None:
     assert total == pytest.approx(sum(got.values()))
 
 
-def test_a_returned_job_is_rewarded_once(small) -> None:
-    """The arm faults in the twelfth cycle; the rest is short enough for a second try."""
-    jobs = [small.job("a", small.work(payload_kg=small.HOT), value=4.0, repetitions=16)]
+@pytest.mark.parametrize(("repetitions", "returns"), [(16, 1), (40, 2)], ids=["finished", "given up"])
+def test_a_returned_job_is_rewarded_once_and_one_that_is_given_up_never(small, repetitions, returns) -> None:
+    """The arm faults in the twelfth cycle; the rest is short enough for a second try, or not."""
+    jobs = [small.job("a", small.work(payload_kg=small.HOT), value=4.0, repetitions=repetitions)]
     env, terms = played_alone(small, jobs, RewardWeights(faults=-7.0, above_warning=-10.0), ticks=600)
     faults = [event.time_s for event in env.events if event.kind == "fault"]
-    assert len(faults) == env.truth.returns[0, 0] > 0
-    assert terms["finished_value"].sum() == 4.0
+    assert len(faults) == env.truth.returns[0, 0] == returns
+    assert (env.events[-1].kind == "give_up") == (returns == 2)
+    assert terms["finished_value"].sum() == (4.0 if returns == 1 else 0.0)
     assert np.flatnonzero(terms["faults"]).tolist() == [int(time_s // 10.0) for time_s in faults]
     assert terms["faults"].sum() == -7.0 * len(faults)
     assert terms["above_warning"].sum() == pytest.approx(-10.0 * env.truth.above_warning_s.sum() / 60.0)
-
-
-def test_a_job_that_is_given_up_is_not_rewarded(small) -> None:
-    """The episode ends with the second fault of the only arm."""
-    jobs = [small.job("a", small.work(payload_kg=small.HOT), value=4.0, repetitions=40)]
-    env, terms = played_alone(small, jobs, RewardWeights(faults=-7.0), ticks=600)
-    assert env.truth.returns[0, 0] == 2
-    assert env.events[-1].kind == "give_up"
-    assert terms["finished_value"].sum() == 0.0
-    assert terms["faults"].sum() == -14.0
-    assert len(terms["faults"]) == int(env.events[-1].time_s // 10.0) + 1 < 600
 
 
 SEED = 7
@@ -185,7 +157,7 @@ def played(env, seed=SEED):
     return env.truth, rewards, seconds
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_an_episode_ends_the_same_in_fewer_steps(small, seed) -> None:
     shifts = small.Shifts(ticks=80)
     every, all_rewards, intervals = played(parallel_env(shifts), seed)
@@ -210,33 +182,6 @@ def test_a_step_ends_as_soon_as_an_arm_may_claim_a_job(small) -> None:
         at_work = env.truth.mode[0] == WORKING
         warned = (env.truth.temp_c[0, :, :7].max(axis=1) >= env.world.tables.warning_c) & at_work
         assert ended or may_claim or warned.any()
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_a_batch_steps_as_the_single_environment(small, threads) -> None:
-    shifts, envs = small.Shifts(ticks=60, absences=5), 5
-    batch = BatchEnv(shifts.library(), envs, seed=SEED, autoreset=False, decisions="events", threads=threads)
-    obs, _ = batch.reset()
-    rewards, seconds = np.zeros(envs), np.zeros(envs)
-    running = np.ones(envs, bool)
-    final = {}
-    while running.any():
-        obs, reward, over, cut, info = batch.step(first_legal(obs["action_mask"]))
-        rewards[running] += reward[running]
-        seconds[running] += info["elapsed_s"][running]
-        ended = over | cut
-        state = batch.state
-        final |= {e: (state.finished_s[e], state.temp_c[e]) for e in np.flatnonzero(ended & running).tolist()}
-        running &= ~ended
-        if running.any():
-            obs, _ = batch.reset(rows=ended)
-    for e in range(envs):
-        truth, single, spans = played(parallel_env(shifts, decisions="events"), SEED + e)
-        jobs = truth.finished_s.shape[1]
-        np.testing.assert_array_equal(final[e][0][:jobs], truth.finished_s[0])
-        np.testing.assert_array_equal(final[e][1], truth.temp_c[0])
-        assert rewards[e] == pytest.approx(sum(single), rel=1e-12)
-        assert seconds[e] == sum(spans)
 
 
 def test_bad_choices_are_refused(small) -> None:

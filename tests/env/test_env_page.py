@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from docs.tables import fill_tables, main
+from docs.tables import fill_tables
 from fleet.engine.batch import TERMS
 from fleet.observation import BIDS, FIELDS, Layout
 from scenarios.prepare.batch import make_batch
@@ -20,16 +20,6 @@ TEXT = PAGE.read_text(encoding="utf-8")
 
 def test_tables_are_current() -> None:
     assert fill_tables(TEXT) == TEXT, "write it anew with: python docs/tables.py"
-
-
-def test_the_command_reports_an_outdated_table(tmp_path, capsys) -> None:
-    page, docs = tmp_path / "env.md", ["--docs", str(tmp_path)]
-    page.write_text(TEXT.replace("| `left_s` | jobs | 0 |", "| `left_s` | jobs | 7 |"), encoding="utf-8")
-    assert main([*docs, "--check"]) == 1
-    assert "env.md" in capsys.readouterr().out
-    assert main(docs) == 0
-    assert page.read_text(encoding="utf-8") == TEXT
-    assert main([*docs, "--check"]) == 0
 
 
 def test_offsets_of_the_table_are_correct() -> None:

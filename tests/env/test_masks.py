@@ -22,7 +22,7 @@ def test_a_legal_claim_made_alone_is_won_and_an_illegal_one_is_only_counted(batc
     envs = len(tries) + 1
     rows, (arm, action) = np.arange(len(tries)), np.array(tries).T
     counts = dict.fromkeys(("legal", "illegal", "given back", "at work", "faulted", "taken"), 0)
-    for seed, stop in product(range(3), range(2, 32, 3)):
+    for seed, stop in product(range(3), range(2, 32, 5)):
         env, rng = batch(envs, WARM, seed=[seed] * envs, autoreset=False), np.random.default_rng(seed)
         obs, _ = env.reset()
         for _ in range(stop):
@@ -62,21 +62,19 @@ def test_a_legal_claim_made_alone_is_won_and_an_illegal_one_is_only_counted(batc
         counts["faulted"] += int((before.mode[0] == FAULTED).sum())
         offered = env.layout.read_parts(obs["shared"][0], obs["own"][0], mask).offered
         counts["taken"] += int((offered & (mask[:, 1:-1] == 0))[before.mode[0] == IDLE].sum())
-    assert min(counts.values()) > 10, counts
+    assert min(counts.values()) > 5, counts
 
 
 def test_illegal_and_missing_actions_equal_a_wait(make, play) -> None:
-    options = {"keep_events": True}
-    for envs in ([make(), make(), make()], [make(**options), make(**options), make(**options)]):
-        for env in envs:
-            env.reset(seed=3)
-        for _ in range(20):
-            masks = {a: o.action_mask for a, o in envs[0].knowledge().items()}
-            wrong = {arm: int(np.flatnonzero(m == 0)[-1]) if (m == 0).any() else 99 for arm, m in masks.items()}
-            given = [
-                play.plain(env.step(each)) for env, each in zip(envs, ({}, dict.fromkeys(masks, 0), wrong), strict=True)
-            ]
-            for step in given:
-                for info in step[-1].values():
-                    del info["illegal"]
-            assert given[0] == given[1] == given[2]
+    envs = [make(), make(), make()]
+    for env in envs:
+        env.reset(seed=3)
+    for _ in range(20):
+        masks = {a: o.action_mask for a, o in envs[0].knowledge().items()}
+        wrong = {arm: int(np.flatnonzero(m == 0)[-1]) if (m == 0).any() else 99 for arm, m in masks.items()}
+        actions = ({}, dict.fromkeys(masks, 0), wrong)
+        given = [play.plain(env.step(each)) for env, each in zip(envs, actions, strict=True)]
+        for step in given:
+            for info in step[-1].values():
+                del info["illegal"]
+        assert given[0] == given[1] == given[2]

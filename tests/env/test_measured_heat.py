@@ -12,16 +12,16 @@ from agents.schedules import Schedules
 from fleet.bus.exchange.channel import Channel
 from fleet.bus.exchange.memory import Exchange
 from fleet.difficulty import KNOWN, Difficulty, Forecast
-from fleet.engine.batch import Engine, RewardWeights, empty_parts
+from fleet.engine.batch import RewardWeights
+from fleet.engine.shift import Episode
 from fleet.engine.world import CYCLES_S
 from fleet.env.lookahead import CellSimulator
 from fleet.env.vector import BatchEnv, Library
 from fleet.heat.motor import gen3_motors
 from fleet.heat.thermal import ThermalModel, gen3_network, temperature_steps, thermal_model
 from fleet.motion import Drive, drive, static_drive
-from fleet.observation import Layout
-from fleet.robot import JOINTS
-from fleet.telemetry import WORKING
+from fleet.robot import JOINTS, ThermalLimits
+from tests.engine.test_compiled import check_equal
 
 GAIN_K = 20.0
 
@@ -77,6 +77,8 @@ def test_a_measured_excess_raises_the_predictions_for_that_work_of_all_arms(smal
     assert job_c == pytest.approx(hotter, abs=0.01)
     # Five jobs are left: rack, bench, rack, bench, rack.
     assert peaks(env, obs)[:, :5] == pytest.approx(np.tile([30.0, hotter, 30.0, hotter, 30.0], (3, 1)), abs=0.01)
+    obs, _ = env.reset()  # a new shift begins without measurements
+    assert peaks(env, obs) == pytest.approx(np.full((3, 6), 30.0))
 
 
 def test_the_excess_is_of_the_hottest_motor(small) -> None:
@@ -129,14 +131,6 @@ def test_without_a_difference_or_without_learning_nothing_changes(small, learns,
     env.reset()
     obs, *_ = env.step(np.array([[1, 0, 0]]))
     assert peaks(env, obs)[:, :5] == pytest.approx(np.full((3, 5), 30.0), abs=1e-4)
-
-
-def test_a_new_shift_begins_without_measurements(small) -> None:
-    env = env_of(small)
-    env.reset()
-    env.step(np.array([[1, 0, 0]]))
-    obs, _ = env.reset()
-    assert peaks(env, obs) == pytest.approx(np.full((3, 6), 30.0))
 
 
 def test_a_planner_simulates_the_heat_that_arms_have_measured(small) -> None:
@@ -270,7 +264,7 @@ def test_an_idle_arm_finds_by_how_much_its_sensors_have_drifted(small, drift_k_p
     assert least_k <= env.engine.measured(0, [0])[1][0] <= most_k
 
 
-def test_compiled_and_plain_loops_agree_also_after_faults(small) -> None:
+def test_compiled_and_uncompiled_agree_with_measured_heat_and_faults(small) -> None:
     """Random claims of heavy jobs in hot air: arms fault, recover, and go home without a job."""
     works = [small.work(place, payload) for place in ("bench", "rack") for payload in (small.WARM, small.HOT)]
     fan = thermal_model(gen3_network(cooling="forced_air"))
@@ -281,22 +275,8 @@ def test_compiled_and_plain_loops_agree_also_after_faults(small) -> None:
                   for work, plans in own.plans.items()} if i else {}  # fmt: skip
         arms.append(replace(own, executed=harder, learns=True, known=(fan, gen3_motors())))
     jobs = [small.job(f"j{j}", works[j % 4], repetitions=60, release_s=30.0 * j) for j in range(24)]
-    world, _ = small.shop([jobs], arms=arms, ticks=400, slots=6, ambient_c=45.0)
-    tables, shift = world.tables, replace(world.shifts[0], noise_key=7)
-    layout, one = Layout(3, 6, plans=1), np.zeros(1, int)
-    engines = [Engine(tables, 1, layout, RewardWeights(), jobs=24, compiled=compiled) for compiled in (True, False)]
-    parts = [empty_parts(layout, 1) for _ in engines]
-    for engine, out in zip(engines, parts, strict=True):
-        engine.reset(one, [shift])
-        engine.observe(one, out)
-    rng, lost = np.random.default_rng(3), 0
-    for _ in range(300):
-        actions = np.array([[int(rng.choice(np.flatnonzero(each[:-1]))) for each in engines[0].mask[0]]])
-        for engine, out in zip(engines, parts, strict=True):
-            engine.step(actions, out)
-        for mine, other in zip(*parts, strict=True):
-            assert np.array_equal(mine, other)
-        state = engines[0].state
-        lost += int(((state.job[0] < 0) & (state.plan[0] >= 0) & (state.mode[0] == WORKING)).sum())
-    assert engines[0].state.faults.sum() > 2
-    assert lost  # arms went home without a job
+    limits = ThermalLimits(warning_c=56.0, error_c=60.0, restart_c=54.0, clear_s=25.0)
+    world, plant = small.shop([jobs], arms=arms, ticks=200, slots=6, ambient_c=45.0, limits=limits)
+    run = check_equal(Episode(world, plant, ("t",) * 3, np.random.SeedSequence(7)), 3)
+    assert run.state.faults.sum() > 2
+    assert {"return", "recover", "home"} <= {event.kind for event in run.env.events}

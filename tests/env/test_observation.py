@@ -1,6 +1,7 @@
 """Observations and action masks: every field against a reference from `World` and `State`, or worked by hand."""
 
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from fleet.bus.exchange.memory import UNHEARD, Exchange, PeerView
 from fleet.difficulty import Forecast
 from fleet.engine.batch import Engine, Parts, RewardWeights, empty_parts
 from fleet.engine.profile_plant import sensor_noise
-from fleet.engine.shift import Episode, broadcast, initial, step, write_members
+from fleet.engine.shift import Episode, broadcast, initial, write_members
 from fleet.engine.state import State
 from fleet.engine.world import World
 from fleet.env.allocation_v2 import parallel_env
@@ -61,30 +62,10 @@ def test_a_packed_observation_is_read_back(arms, slots, plans, scaled, delivered
     for name, value in named.items():
         np.testing.assert_array_equal(getattr(again, name), value, err_msg=name)
     assert again.action_mask is mask
+    assert (np.frexp(layout.scales)[0] == 0.5).all()
     low, high = layout.bounds
     assert ((low <= vector) & (vector <= high)).all()
     assert layout.size == sum(int(np.prod(layout.shape(f))) for f in FIELDS)
-
-
-def test_the_vector_is_both_parts_one_after_the_other() -> None:
-    rng = np.random.default_rng(0)
-    for delivered in (False, True):
-        layout = Layout(3, 4, plans=2, delivered=delivered)
-        parts = rng.random((2, layout.shared), np.float32), rng.random((2, 3, layout.size - layout.shared), np.float32)
-        vectors, mask = layout.join(*parts), np.ones((2, 3, layout.actions), np.int8)
-        for e, a in np.ndindex(2, 3):
-            assert vectors[e, a].tolist() == [*parts[0][e], *parts[1][e, a]]
-        one, other = layout.read(vectors, mask), layout.read_parts(*parts, mask)
-        begin = 0
-        for f in FIELDS:
-            end = begin + int(np.prod(layout.shape(f)))
-            np.testing.assert_array_equal(getattr(one, f.name).reshape(2, 3, -1), vectors[..., begin:end])
-            np.testing.assert_array_equal(getattr(other, f.name), getattr(one, f.name))
-            begin = end
-        # What all arms of a fleet know alike, unless messages between them take time.
-        first_own = "fleet_age_s" if delivered else "working"
-        place = [f.name for f in FIELDS].index(first_own)
-        assert layout.shared == sum(int(np.prod(layout.shape(f))) for f in FIELDS[:place])
 
 
 def test_the_peers_of_an_unknown_arm_are_unknown() -> None:
@@ -95,13 +76,6 @@ def test_the_peers_of_an_unknown_arm_are_unknown() -> None:
     )
     assert (alone.peer_age_s.shape, alone.peer_difficulty.shape, alone.fleet_age_s.shape) == ((0,), (0, 4), (3,))
     assert (all_.peer_age_s.shape, all_.peer_difficulty.shape) == ((2, 3, 2), (2, 3, 2, 4))
-
-
-def test_the_scales_are_powers_of_two() -> None:
-    layout = Layout(4, 16, plans=2, scaled=True)
-    assert (np.frexp(layout.scales)[0] == 0.5).all()
-    assert (Layout(4, 16, plans=2).scales == 1.0).all()
-    assert len(layout.scales) == layout.size
 
 
 def test_values_out_of_range_are_clipped() -> None:
@@ -332,6 +306,7 @@ def compare_with_reference(
             values, observed = expected[name], getattr(actual, name)
             atol = COMPARED.get(name, 2e-5)
             np.testing.assert_allclose(observed, values.reshape(observed.shape), rtol=1e-5, atol=atol, err_msg=name)
+        assert not layout.scaled or np.abs(np.concatenate([each.ravel() for each in runner.parts])).max() < 30.0
         np.testing.assert_array_equal(runner.mask, reference_mask(world, runner.state, slots, expected))
         closed += int(((expected["duration_s"] > 0) > expected["free"]).sum())
         if runner.tick == world.ticks:
@@ -366,7 +341,17 @@ def test_vectors_equal_the_reference(small, play, draft, two_plans, data) -> Non
 def test_shifts_of_the_comparison_include_faults_returned_jobs_and_closed_space(small, play) -> None:
     limits = ThermalLimits(warning_c=56.0, error_c=60.0, restart_c=54.0, clear_s=25.0)
     make = small.Shifts(arms=3, jobs=9, ticks=80, ambient_c=45.0, limits=limits, crowding=0.3, absences=7)
-    played = [compare_with_reference(play, make(np.random.SeedSequence(seed)), seed) for seed in range(4)]
+    near = ((2,), (0,), (1,))
+    options: tuple[dict[str, Any], ...] = (
+        {},
+        {"ahead_s": 11.5},
+        {"scaled": True, "bids": True},
+        {"scaled": True, "near": near, "ahead_s": 40.3},
+    )
+    played = [
+        compare_with_reference(play, make(np.random.SeedSequence(seed)), seed, **each)
+        for seed, each in enumerate(options)
+    ]
     last = [state for state, _ in played]
     assert sum(closed for _, closed in played) > 0
     assert sum(int(state.faults.sum()) for state in last) > 0
@@ -395,49 +380,6 @@ def test_messages_that_arrive_at_once_give_what_the_arms_know_of_each_other(smal
     compare_with_reference(
         play, make(np.random.SeedSequence(4)), 4, Exchange(("arm_0", "arm_1", "arm_2"), never), near=near, bids=True
     )
-
-
-def test_options_of_arms_that_are_home_later_are_zero_and_others_unchanged(small, play) -> None:
-    episode, rng = (
-        small.Shifts(arms=3, jobs=9, ticks=60, crowding=0.3)(np.random.SeedSequence(2)),
-        np.random.default_rng(2),
-    )
-    world, ahead_s = episode.world, 11.5
-    whole, some = (Single(episode, ahead_s=each) for each in (np.inf, ahead_s))
-    layout = whole.layout
-    hidden = shown = 0
-    while whole.tick < world.ticks:
-        one, other = (layout.read_parts(*runner.parts, runner.mask) for runner in (whole, some))
-        late = one.busy_s > ahead_s
-        for name, values in play.named(one).items():
-            if name in ("duration_s", "difficulty", "p_saturation", "peak_c", "blocked"):
-                hidden, shown = hidden + int((values[late] != 0).sum()), shown + int((values[~late] != 0).sum())
-                values = np.where(late[:, None], 0.0, values)
-            np.testing.assert_array_equal(getattr(other, name), values, err_msg=name)
-        actions = play.chosen(whole.mask, rng.random((3, 2)))
-        whole.step(actions), some.step(actions)
-    assert min(hidden, shown) > 50
-
-
-@pytest.mark.parametrize("near", [None, ((2,), (0,), (1,))])
-def test_scaled_values_times_their_scales_are_the_values(small, play, near) -> None:
-    """Exactly: scales are powers of two."""
-    content = [small.work(place, payload) for place in ("a", "b") for payload in (small.LIGHT, small.HOT)]
-    arms = [small.arm(a, content, model=play.Learned(2, curve=True)) for a in range(3)]
-    jobs = [small.job(f"j{i}", content[i % 4], release_s=50.0 * (i % 3)) for i in range(6)]
-    world, plant = small.shop([jobs], arms=arms, ticks=50, space=small.crowded(0.3))
-    episode, rng = Episode(world, plant, ("t",) * 3, np.random.SeedSequence(1)), np.random.default_rng(1)
-    plain, scaled = (Single(episode, near=near, scaled=each) for each in (False, True))
-    layout = scaled.layout
-    for _ in range(world.ticks):
-        vectors = layout.join(*scaled.parts)
-        np.testing.assert_array_equal(vectors * layout.scales, layout.join(*plain.parts))
-        assert np.abs(vectors).max() < 30.0  # of order 1
-        one, other = plain.layout.read_parts(*plain.parts, plain.mask), layout.read(vectors, scaled.mask)
-        for name, values in play.named(one).items():
-            np.testing.assert_array_equal(getattr(other, name), values, err_msg=name)
-        actions = play.chosen(plain.mask, rng.random((3, 2)))
-        plain.step(actions), scaled.step(actions)
 
 
 NO_NOISE = replace(gen3_motors(), sensor_noise_k=np.zeros(7))
@@ -489,7 +431,8 @@ def observe(world: World, state: State, **options) -> Observation:
 # Single fields
 
 
-def test_peers_are_the_others_in_order() -> None:
+@pytest.mark.parametrize("near", [None, ((2, 1), (3, 0), (3, 1), (0, 2))], ids=["all", "nearest"])
+def test_peers_are_those_of_the_layout_in_its_order(near) -> None:
     receiver, sender = np.indices((4, 4))
     view = received(
         4, 2,
@@ -498,28 +441,18 @@ def test_peers_are_the_others_in_order() -> None:
         difficulty=np.stack([receiver + sender / 10, np.full((4, 4), np.nan)], axis=-1),
         mode=np.where(sender == 3, FAULTED, np.where(sender == 1, WORKING, IDLE)),
     )  # fmt: skip
-    observed = peers_of(Layout(4, 2, delivered=True), view)
+    observed = peers_of(Layout(4, 2, near, delivered=True), view)
     for me in range(4):
-        others = [a for a in range(4) if a != me]
+        others = [a for a in range(4) if a != me] if near is None else list(near[me])
+        assert observed.peers[me].tolist() == (others if near is None else [0, 1])
         assert observed.peer_headroom_k[me].tolist() == [10.0 * me + a for a in others]
         assert observed.peer_age_s[me].tolist() == [100.0 * me + a for a in others]
         assert observed.peer_difficulty[me, :, 0].tolist() == pytest.approx([me + a / 10 for a in others])
-        assert observed.peer_known[me].tolist() == [[1, 0]] * 3
+        assert observed.peer_known[me].tolist() == [[1, 0]] * len(others)
         assert (observed.peer_difficulty[me, :, 1] == -1).all()
-        assert observed.peers[me].tolist() == others
-        assert observed.fleet_headroom_k[me].tolist() == [10.0 * me + a for a in range(4)]
         assert observed.peer_working[me].tolist() == [a == 1 for a in others]
         assert observed.peer_faulted[me].tolist() == [a == 3 for a in others]
         assert observed.peer_heard[me].all()
-
-
-def test_nearest_peers_are_in_the_order_of_the_layout() -> None:
-    near = ((2, 1), (3, 0), (3, 1), (0, 2))
-    _, sender = np.indices((4, 4))
-    observed = peers_of(Layout(4, 2, near, delivered=True), received(4, 2, headroom_k=1.0 * sender))
-    assert observed.peer_headroom_k.tolist() == [list(map(float, peers)) for peers in near]
-    assert observed.fleet_headroom_k.tolist() == observed.peer_headroom_k.tolist()
-    assert observed.peers.tolist() == [[0, 1]] * 4
 
 
 def test_a_peer_whose_messages_never_arrived_is_unknown() -> None:
@@ -593,39 +526,6 @@ def test_slots_hold_each_arm_s_own_view_of_the_jobs(small) -> None:
     assert observed.action_mask[0].tolist() == [[1, 1, 1, 0, 0], [1, 1, 0, 0, 0]]
 
 
-def test_jobs_that_share_a_station_have_the_group_of_the_first(small) -> None:
-    """Three jobs at the bench, one of them to the rack as well."""
-    content = [small.work("bench"), small.work("press"), small.work("bench", to="rack"), small.work("rack"),
-               small.work("bench", small.HOT)]  # fmt: skip
-    world, _ = small.shop([[small.job(f"j{i}", each) for i, each in enumerate(content)]], slots=6)
-    observed = observe(world, initial(world))
-    assert observed.group[0].tolist() == [[1, 2, 1, 1, 1, 0]] * 2
-    assert observed.offered[0].tolist() == [[True] * 5 + [False]] * 2
-    assert observed.station_free[0].tolist() == [[1] * 5 + [0]] * 2
-
-
-def test_a_job_is_blocked_for_an_arm_whose_fastest_plan_needs_taken_space(small) -> None:
-    """`blocked` follows from the volumes of the plans of arms away from home; an arm does not block itself."""
-    bench, rack = small.work("bench"), small.work("rack")
-    arms = [small.arm(i, [bench, rack]) for i in range(3)]
-    jobs = [small.job("a", bench), small.job("b", rack), small.job("c", rack)]
-
-    def excluding(plans) -> tuple[np.ndarray, np.ndarray]:
-        one = [plan.arm == "arm_0" and plan.work == bench for plan in plans]
-        other = [plan.arm == "arm_1" and plan.work == rack for plan in plans]
-        conflicts = np.outer(one, other) | np.outer(other, one)
-        return np.arange(len(plans)), conflicts
-
-    world, plant = small.shop([jobs], arms=arms, slots=3, space=excluding)
-    before = initial(world)
-    assert not observe(world, before).blocked.any()
-    after = step(world, before, np.array([[1, 0, 0]]), plant, compiled=False).state
-    assert after.mode[0].tolist() == [WORKING, IDLE, IDLE]
-    observed = observe(world, after)
-    assert observed.blocked[0].tolist() == [[0, 0, 0], [1, 1, 0], [0, 0, 0]]
-    assert observed.action_mask[0].tolist() == [[1, 0, 0, 0, 1], [1, 0, 0, 0, 0], [1, 1, 1, 0, 0]]
-
-
 def test_an_arm_broadcasts_what_it_measures_and_its_scores(small) -> None:
     content = small.work()
     arms = [small.arm(i, [content], motors=NO_NOISE) for i in range(2)]
@@ -647,19 +547,6 @@ def test_an_arm_broadcasts_what_it_measures_and_its_scores(small) -> None:
 
 
 # Peers and sensors in an episode
-
-
-def test_a_delayed_message_is_as_old_as_its_delay(small) -> None:
-    exchange = Exchange(("arm_0", "arm_1"), Channel(delay_s=20.0))
-    env = parallel_env(small.Shifts(arms=2), exchange=exchange)
-    env.reset(seed=1)
-    ages = []
-    for _ in range(5):
-        observed = env.knowledge()["arm_0"]
-        ages.append((float(observed.peer_heard[0]), float(observed.peer_age_s[0])))
-        env.step({})
-    assert ages == [(0.0, LONG_S), (0.0, LONG_S), (1.0, 20.0), (1.0, 20.0), (1.0, 20.0)]
-    env.close()
 
 
 def test_temperatures_are_measured_with_the_noise_of_the_sensors(small) -> None:
@@ -689,31 +576,10 @@ def test_the_peers_are_the_nearest_in_space(name, peers) -> None:
         np.testing.assert_allclose(np.linalg.norm(mounts_m[list(own)] - mounts_m[a], axis=1), far_m[a, 1:])
 
 
-@pytest.mark.ci_slow
-def test_fields_of_the_nearest_peers_equal_those_of_all_peers(plans, play) -> None:
-    options = {"difficulty": "blind", "cache": plans, "horizon_s": 600, "bids": True}
-    all_, few = (make_batch("quickstart", 3, seed=5, peers=n, **options) for n in (None, 2))
-    single = make_env("quickstart", peers=2, **options)
-    all_.reset(), few.reset()
-    alone, _ = single.reset(seed=5)
-    near = near_of(load("quickstart"), 2)
-    assert near is not None
-    of_plans = 3 * (few.layout.actions - 2)
-    assert few.layout.size == all_.layout.size - 2 * (5 + few.layout.slots + of_plans)
-    rng = np.random.default_rng(0)
-    for _ in range(40):
-        whole, part = all_.knowledge(), few.knowledge()
-        for name, values in play.named(whole).items():
-            if name == "peers":
-                values = np.tile(np.arange(2), (3, 4, 1))
-            elif name.startswith("fleet_"):
-                values = values[:, np.arange(len(near))[:, None], np.array(near)]
-            np.testing.assert_array_equal(getattr(part, name), values, err_msg=name)
-        mask = whole.action_mask
-        actions = (rng.random(mask.shape) * mask).argmax(-1)
-        _, (obs, *_) = all_.step(actions), few.step(actions)
-        alone, *_ = single.step(dict(zip(single.agents, actions[0], strict=True)))
-        np.testing.assert_array_equal(alone["arm_2"]["observation"], few.joined(obs)["observation"][0, 2])
+def test_a_number_of_peers_shares_the_nearest_ones(cell, plans) -> None:
+    options = {"difficulty": "blind", "cache": plans, "peers": 1}
+    for layout in (make_batch(cell, 2, **options).layout, make_env(cell, **options).layout):
+        assert layout.near == near_of(cell, 1)
 
 
 @pytest.mark.parametrize("peers", [-1, 4, 1.5, True, "all"])

@@ -40,13 +40,10 @@ from tests.profiles import examples
 @pytest.mark.parametrize(
     ("tilt_deg", "kind"),
     [
-        ((0, 0, 0), "floor"),
         ((0, 0, 180), "floor"),
         ((180, 0, 0), "ceiling"),
-        ((0, 90, 0), "wall"),
         ((90, 0, 0), "wall"),
         ((0, -90, 30), "wall"),
-        ((45, 0, 0), "tilted"),
         ((0, 140, 0), "tilted"),
     ],
 )
@@ -56,36 +53,29 @@ def test_mounts_are_named(tilt_deg, kind) -> None:
 
 def test_a_scene_equals_the_state_of_its_world(small) -> None:
     work, heavy = small.work("bench"), small.work("rack", payload_kg=2.5)
-    jobs = [small.job("now", work), small.job("next", heavy, due_s=5.0), small.job("late", work, release_s=500.0)]
+    jobs = [
+        small.job("now", work, repetitions=1),
+        small.job("next", heavy, due_s=5.0),
+        small.job("late", work, release_s=500.0),
+    ]
     arms = [small.arm(0, [work]), small.arm(1, [work, heavy])]
     world, plant = small.shop([jobs], arms=arms)
     state = step(world, initial(world), np.array([[1, 0]]), plant).state
     observed = scene_of(world, state)
-    assert (observed.time_s, observed.horizon_s, observed.finished, observed.waiting, observed.faults) == (
-        10.0,
-        600.0,
-        0,
-        1,
-        0,
-    )
+    assert (observed.time_s, observed.horizon_s) == (10.0, 600.0)
+    assert (observed.finished, observed.waiting, observed.faults) == (0, 1, 0)
     assert (observed.mode, observed.job, observed.at) == ((WORKING, IDLE), ("now", ""), (("bench",), ()))
-    assert observed.progress == (pytest.approx(10.0 / (3.0 + 3 * 10.0 + 2.0)), 0.0)
+    assert observed.progress == (pytest.approx(10.0 / (3.0 + 10.0 + 2.0)), 0.0)
     assert observed.queue == (
         QueuedJob(job="next", payload_kg=2.5, due_in_s=-5.0, able=(False, True), free=(False, True)),
     )
     np.testing.assert_array_equal(observed.temp_c, state.temp_c[0, :, :JOINTS])
+    state = step(world, step(world, state, np.zeros((1, 2), int), plant).state, np.zeros((1, 2), int), plant).state
+    state.faults[0, 1] = 2
+    later = scene_of(world, state)
+    assert (later.finished, later.waiting, later.faults, later.job) == (1, 1, 2, ("", ""))
     with pytest.raises(ValueError, match=r"The cell has the arms arm_0; the world has arm_0, arm_1\."):
         scene_of(world, state, grid_cell(("arm_0",), ()))
-
-
-def test_a_finished_job_and_a_fault_are_counted(small) -> None:
-    world, plant = small.shop([[small.job("a", small.work("bench"), repetitions=1)]])
-    state = initial(world)
-    for action in (1, 0):
-        state = step(world, state, np.array([[action, 0]]), plant).state
-    state.faults[0, 1] = 2
-    observed = scene_of(world, state)
-    assert (observed.finished, observed.waiting, observed.faults, observed.job) == (1, 0, 2, ("", ""))
 
 
 FAULT = (0xCC, 0x22, 0x22)
@@ -134,19 +124,14 @@ def luminance(colour: Any) -> np.ndarray:
 
 
 def around(frame: np.ndarray, plan: FloorPlan, arm: int) -> np.ndarray:
-    """Return the part of a picture around an arm."""
     x, y = plan.centres[arm].round().astype(int)
     return frame[y - plan.reach : y + plan.reach + 1, x - plan.reach : x + plan.reach + 1]
 
 
-@given(st.floats(-20, 150), st.floats(-20, 150))
-def test_hotter_colours_are_never_brighter(one_c, other_c) -> None:
+@given(st.floats(-20, 150), st.floats(-20, 150), st.floats(20, 79))
+def test_hotter_colours_are_never_brighter_and_five_kelvin_are_a_visible_difference(one_c, other_c, temp_c) -> None:
     low, high = heat_colour(np.sort([one_c, other_c]), 60.0, 75.0)
     assert luminance(high) <= luminance(low) + 1e-9
-
-
-@given(st.floats(20, 79))
-def test_five_kelvin_are_a_visible_difference(temp_c) -> None:
     cool, hot = heat_colour(np.array([temp_c, temp_c + 5.0]), 60.0, 75.0)
     assert luminance(hot) < luminance(cool) - 0.009
 
@@ -165,7 +150,7 @@ def test_each_motor_has_the_colour_of_its_own_temperature() -> None:
     np.testing.assert_allclose(frame[y, x], 255 * heat_colour(temps, 60.0, 75.0), atol=1.0)
 
 
-@pytest.mark.parametrize("arms", [1, 4, 16, 64])
+@pytest.mark.parametrize("arms", [1, 64])
 def test_a_faulted_arm_stands_out(arms) -> None:
     cell = grid_cell(tuple(f"arm_{i}" for i in range(arms)), ())
     plan = floor_plan(cell)
@@ -221,6 +206,7 @@ def test_every_field_of_a_scene_changes_the_picture() -> None:
     ]
     frames = [draw(each).tobytes() for each in (base, *others)]
     assert len(set(frames)) == len(frames)
+    assert draw(base).tobytes() == frames[0]
 
 
 @pytest.mark.parametrize(
@@ -241,14 +227,6 @@ def test_a_name_covers_no_motor_of_another_arm() -> None:
             assert (busy[near] == idle[near]).all()
 
 
-@pytest.mark.parametrize("arms", [1, 2, 64])
-def test_pictures_have_one_size_and_repeat(arms) -> None:
-    busy = scene(row(arms), temp_c=np.full((arms, JOINTS), 61.0), mode=(WORKING,) * arms)
-    frame = draw(busy)
-    assert (frame.shape, frame.dtype) == ((HEIGHT, WIDTH, 3), np.uint8)
-    assert (draw(busy) == frame).all()
-
-
 words = st.text(max_size=60)
 
 
@@ -259,7 +237,7 @@ def test_any_name_can_be_drawn(arm, station, job, title) -> None:
     cell = replace(row(1), arms=(arm,), stations=((station, (0.0, 1.0, 0.0)),))
     offer = QueuedJob(job=job, payload_kg=1.0, due_in_s=-1e6, able=(True,), free=(False,))
     frame = draw(scene(cell, job=(job,), at=((station,),), queue=(offer,), title=title))
-    assert frame.shape == (HEIGHT, WIDTH, 3)
+    assert (frame.shape, frame.dtype) == ((HEIGHT, WIDTH, 3), np.uint8)
 
 
 @given(words, st.integers(0, 200))
@@ -298,7 +276,7 @@ def inside(x: float, y: float, margin: float = 0.0) -> bool:
 
 @examples(40)
 @given(cells())
-def test_every_arm_and_station_is_on_the_floor(cell) -> None:
+def test_arms_stations_and_names_are_on_the_floor_and_names_cover_no_arm_and_no_other_name(cell) -> None:
     plan = floor_plan(cell)
     assert len(plan.centres) == len(cell.arms)
     for a, (x, y) in enumerate(plan.centres.tolist()):
@@ -307,6 +285,14 @@ def test_every_arm_and_station_is_on_the_floor(cell) -> None:
         assert len(np.unique(plan.motors[a], axis=0)) == JOINTS
         assert all(inside(u, v, plan.motor) for u, v in plan.motors[a])
     assert all(inside(x, y, STATION) for x, y in (*plan.stations, *plan.bases))
+    boxes = [(x, y, LETTER * len(text)) for text, x, y in plan.labels]
+    for i, (x, y, long) in enumerate(boxes):
+        assert inside(x, y)
+        assert inside(x + long, y)
+        for u, v in plan.centres:
+            nearest = min(max(u, x), x + long)
+            assert np.hypot(nearest - u, y - v) >= plan.reach
+        assert all(abs(y - v) >= TEXT or x + long < u or u + other < x for u, v, other in boxes[:i])
 
 
 @given(
@@ -353,7 +339,7 @@ def test_distances_on_the_floor_plan_are_to_scale(stations) -> None:
         np.testing.assert_allclose(apart_px, per_m * apart_m, atol=1e-6)
 
 
-@pytest.mark.parametrize("arms", [2, 3, 4, 7, 16])
+@pytest.mark.parametrize("arms", [2, 3, 16])
 def test_arms_at_one_place_do_not_cover_each_other(arms) -> None:
     """An arm on the ceiling above one on the floor."""
     names = tuple(f"arm_{i}" for i in range(arms))
@@ -362,20 +348,6 @@ def test_arms_at_one_place_do_not_cover_each_other(arms) -> None:
     rings = plan.centres
     gaps = np.linalg.norm(rings[:, None] - rings[None], axis=-1)[~np.eye(arms, dtype=bool)]
     assert gaps.min() >= 1.82 * plan.reach  # motors; the arcs of the work done may touch
-
-
-@examples(40)
-@given(cells())
-def test_names_of_stations_cover_no_arm_and_no_other_name(cell) -> None:
-    plan = floor_plan(cell)
-    boxes = [(x, y, LETTER * len(text)) for text, x, y in plan.labels]
-    for i, (x, y, long) in enumerate(boxes):
-        assert inside(x, y)
-        assert inside(x + long, y)
-        for u, v in plan.centres:
-            nearest = min(max(u, x), x + long)
-            assert np.hypot(nearest - u, y - v) >= plan.reach
-        assert all(abs(y - v) >= TEXT or x + long < u or u + other < x for u, v, other in boxes[:i])
 
 
 BLACK = np.zeros((240, 320, 3), np.uint8)

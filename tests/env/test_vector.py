@@ -4,7 +4,7 @@ import gc
 import platform
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +18,7 @@ from fleet.bus.exchange.memory import Exchange
 from fleet.engine.batch import BLOCK
 from fleet.engine.tables import stack_tables
 from fleet.engine.world import Space
+from fleet.env.allocation_v2 import AllocationEnv
 from fleet.env.vector import BatchEnv, Library, Shelf
 from fleet.motion import Plan
 from scenarios.evaluate.rollout import outcomes
@@ -60,13 +61,11 @@ def row(step: dict[str, Any], e: int) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def library(small) -> Library:
-    """Return the library of these shifts."""
     return small.Shifts(**SHIFT).library()
 
 
 @pytest.fixture(scope="module")
 def many(library, play) -> list[dict[str, Any]]:
-    """Return all results of 64 envs."""
     return played(BatchEnv(library, 64, seed=SEED), play, list(range(64)))
 
 
@@ -79,7 +78,7 @@ def test_shifts_of_these_tests_terminate_and_truncate_at_different_times(many) -
     assert (terminated | truncated).sum(axis=0).min() >= 3  # each env is at least in its fourth shift
 
 
-@pytest.mark.parametrize("who", [[0], [1], [40], [63], [5, 6, 7, 8, 9, 10, 11], [63, 2, 31, 0, 17, 30, 44]])
+@pytest.mark.parametrize("who", [[1], [5, 6, 7, 8, 9, 10, 11], [63, 2, 31, 0, 17, 30, 44]])
 def test_a_row_does_not_depend_on_the_other_rows_or_their_order(many, batch, play, who) -> None:
     trace = played(batch(len(who), SHIFT, seed=[SEED + e for e in who]), play, who)
     for one, all_rows in zip(trace, many, strict=True):
@@ -95,30 +94,62 @@ def test_a_row_of_a_thousand_equals_the_row_alone(library, play) -> None:
             play.same(row(one, 0), row(all_rows, e))
 
 
-@pytest.mark.parametrize("keep_events", [False, True])
-@pytest.mark.parametrize("e", [0, 1, 5, 40])
-def test_a_row_equals_the_single_env_over_several_episodes(many, make, play, e, keep_events) -> None:
-    env = make(SHIFT, keep_events=keep_events)
-    contained(play, play.single(env, env.reset(seed=SEED + e)), row(many[0], e))
-    for step, each in zip(many[1:], numbers(e), strict=True):
-        mask = np.stack([observed.action_mask for observed in env.knowledge().values()])
-        actions = dict(zip(env.possible_agents, play.chosen(mask, each).tolist(), strict=True))
-        actual, expected = play.single(env, env.step(actions)), row(step, e)
+ARMS = ("arm_0", "arm_1", "arm_2")
+LATE = Channel(delay_s=25.0, loss=0.3)
+
+
+def both(
+    batch: BatchEnv, env: AllocationEnv, e: int, seed: int, play, *, steps: int = STEPS, rtol: float = 0.0
+) -> Iterator[dict[str, Any]]:
+    """What a single env returns at each step; everything equals row `e` of a batch with the same actions."""
+    given, observed = batch.reset(), play.single(env, env.reset(seed=seed))
+    for step in range(steps):
+        obs = given[0]
+        play.same({n: v[e : e + 1] for n, v in obs.items()}, {n: observed[n] for n in obs})
+        together = play.named(batch.knowledge())
+        for a, known in enumerate(env.knowledge().values()):
+            play.same({name: values[e, a] for name, values in together.items()}, play.named(known))
+        np.testing.assert_array_equal(batch.state.temp_c[e], env.truth.temp_c[0])
+        actions = actions_of(play, obs["action_mask"], step)
+        given = batch.step(actions)
+        observed = play.single(env, env.step(dict(zip(env.possible_agents, actions[e].tolist(), strict=True))))
+        expected = play.rows(given, e)
         assert expected["ended"][0] == (not env.agents)
+        final = "" if env.agents else "final_"
+        for n, values in observed.items():
+            row_values = expected[f"{final}{n}" if n in obs else n]
+            assert values.dtype == row_values.dtype, n
+            np.testing.assert_allclose(values, row_values, rtol=rtol, err_msg=n)
+        yield observed
         if not env.agents:
-            last = {name: actual[name] for name in ("shared", "own", "action_mask")}
-            play.same(last, {name: expected[f"final_{name}"] for name in last})
-            first = play.single(env, env.reset())
-            actual |= {name: first[name] for name in last}
-        contained(play, actual, expected)
+            observed = play.single(env, env.reset())
 
 
-def contained(play, actual: dict[str, Any], expected: dict[str, Any]) -> None:
-    """Assert that all actual values are among the expected ones."""
-    play.same(actual, {name: expected[name] for name in actual})
+def actions_of(play, mask: np.ndarray, step: int) -> np.ndarray:
+    """Return actions that do not depend on the number of rows."""
+    return play.chosen(mask, np.random.default_rng(step).random((1, 3, 2)))
 
 
-@pytest.mark.parametrize("threads", [2, 3, 7])
+@pytest.mark.parametrize(
+    ("e", "single", "many"),
+    [
+        (0, {}, {}),
+        (5, {"keep_events": True}, {}),
+        (3, {"decisions": "events"}, {"decisions": "events", "threads": 2}),
+        (3, {"exchange": Exchange(ARMS, LATE)}, {"exchanges": [Exchange(ARMS, LATE) for _ in range(7)]}),
+    ],
+    ids=["interval", "events recorded", "steps until events", "late messages"],
+)
+def test_a_row_equals_the_single_env_over_several_shifts(make, batch, play, e, single, many) -> None:
+    shift = {**SHIFT, "absences": 5}
+    together, alone = batch(7, shift, seed=SEED, **many), make(shift, **single)
+    rtol = 1e-12 if "decisions" in single else 0.0  # rewards of intervals are added up in another order
+    steps = list(both(together, alone, e, SEED + e, play, rtol=rtol))
+    assert sum(bool(step["terminated"] | step["truncated"]) for step in steps) > 1
+    assert len({float(step["elapsed_s"][0]) for step in steps}) > 1 or "decisions" not in single
+
+
+@pytest.mark.parametrize("threads", [3, 7])
 def test_results_do_not_depend_on_the_number_of_threads(library, play, threads) -> None:
     who = list(range(2 * BLOCK + 40))
     one, several = (played(BatchEnv(library, len(who), seed=SEED, threads=n), play, who, 30) for n in (1, threads))
@@ -126,38 +157,9 @@ def test_results_do_not_depend_on_the_number_of_threads(library, play, threads) 
         play.same(a, b)
 
 
-LATE = Channel(delay_s=25.0, loss=0.3)
-
-
-@pytest.mark.parametrize("e", [0, 3, 6])
-def test_a_row_with_an_exchange_equals_the_single_env(make, batch, play, e) -> None:
-    arms = make(SHIFT).possible_agents
-    exchanges = [Exchange(arms, LATE) for _ in range(7)]
-    env, many = make(SHIFT, exchange=Exchange(arms, LATE)), batch(7, SHIFT, seed=SEED, exchanges=exchanges)
-    actual, given = play.single(env, env.reset(seed=SEED + e)), many.reset()
-    arrived, ends = [], 0
-    for each in np.stack([numbers(e) for e in range(7)], axis=1):
-        play.same({n: actual[n] for n in given[0]}, {n: values[[e]] for n, values in given[0].items()})
-        for a, observed in enumerate(env.knowledge().values()):
-            arrived.append(observed.peer_heard.mean())
-            together = play.named(many.knowledge())
-            play.same({name: values[e, a] for name, values in together.items()}, play.named(observed))
-        actions = play.chosen(given[0]["action_mask"], each)
-        step = env.step(dict(zip(arms, actions[e].tolist(), strict=True)))
-        actual, given = play.single(env, step), many.step(actions)
-        if not env.agents:
-            ends += 1
-            actual = play.single(env, env.reset())
-    assert ends > 1
-    assert 0 < np.mean(arrived) < 1
-
-
 def test_resetting_other_rows_keeps_delivered_messages(batch, play) -> None:
     """Also if the caller has overwritten returned observations."""
-    one, other = (
-        batch(3, SHIFT, seed=SEED, autoreset=False, exchanges=[Exchange(("arm_0", "arm_1", "arm_2"), LATE)] * 3)
-        for _ in range(2)
-    )
+    one, other = (batch(3, SHIFT, seed=SEED, autoreset=False, exchanges=[Exchange(ARMS, LATE)] * 3) for _ in range(2))
     for env in (one, other):
         env.reset()
     for _ in range(4):
@@ -237,11 +239,9 @@ def test_growing_the_job_arrays_changes_no_result(small, library, play) -> None:
     few, lots = library.draw, small.Shifts(**{**SHIFT, "jobs": 23}).library().draw
     mixing = replace(library, draw=lambda seed: (lots if seed.entropy == 2 else few)(seed))
     mixed, alone = BatchEnv(mixing, 3, seed=0), BatchEnv(library, 2, seed=0)
-    one, other, rng = mixed.reset(), alone.reset(), np.random.default_rng(0)
-    for _ in range(12):
-        play.same(play.rows(one, range(2)), play.rows(other, range(2)))
-        actions = play.chosen(one[0]["action_mask"], rng.random((3, 3, 2)))
-        one, other = mixed.step(actions), alone.step(actions[:2])
+    for one, other in zip(played(mixed, play, [0, 1, 2], 12), played(alone, play, [0, 1], 12), strict=True):
+        for e in range(2):
+            play.same(row(one, e), row(other, e))
     assert mixed.state.status.shape[1] >= 23 > alone.state.status.shape[1]
 
 
@@ -296,14 +296,14 @@ if sys.argv[1] == "kept":
     assert keep_pages()
 for _ in range(2):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    np.ones(20_000_000)
+    np.ones(5_000_000)
 print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="mallopt is glibc's")
 def test_keep_pages_reuses_memory() -> None:
-    """Allocate 160 MB twice: the second time the process gets no new pages."""
+    """Allocate 40 MB twice: the second time the process gets no new pages."""
     faults = {
         how: int(subprocess.run([sys.executable, "-c", TURNOVER, how], capture_output=True, check=True).stdout)
         for how in ("given back", "kept")
@@ -318,41 +318,18 @@ VARIED = Randomisation(ambient_k=(-1.0, 3.0), arrivals=(0.8, 1.5), variants=[{"s
 
 @pytest.fixture(scope="module")
 def fleet(cell, plans) -> Fleet:
-    """Return the prepared cell."""
     return prepare(cell, difficulty="blind", cache=plans)
 
 
-def actions_of(play, mask: np.ndarray, step: int) -> np.ndarray:
-    """Return actions that do not depend on the number of rows."""
-    return play.chosen(mask, np.random.default_rng(step).random((1, 3, 2)))
-
-
-@pytest.mark.parametrize("difficulty", ["blind", "oracle"])
-@pytest.mark.parametrize("e", [0, 5])
-@pytest.mark.parametrize("randomise", [None, VARIED], ids=["plain", "randomised"])
+@pytest.mark.parametrize(
+    ("difficulty", "e", "randomise"), [("blind", 0, None), ("oracle", 5, VARIED)], ids=["plain", "randomised"]
+)
 def test_a_row_equals_make_env_with_the_same_seed(cell, plans, play, e, difficulty, randomise) -> None:
     options: dict[str, Any] = {"difficulty": difficulty, "randomise": randomise, "cache": plans}
     batch, env = make_batch(cell, 6, LAST_SEED, **options), make_env(cell, **options)
-    obs, _ = batch.reset()
-    observed = play.single(env, env.reset(seed=LAST_SEED + e))
-    ends, faults = [], 0
-    for step in range(140):
-        play.same({n: v[e : e + 1] for n, v in obs.items()}, {n: observed[n] for n in obs})
-        actions = actions_of(play, obs["action_mask"], step)
-        given = batch.step(actions)
-        obs = given[0]
-        observed = play.single(env, env.step(dict(zip(env.possible_agents, actions[e].tolist(), strict=True))))
-        expected = play.rows(given, e)
-        play.same(
-            {n: v for n, v in observed.items() if n not in obs}, {n: expected[n] for n in observed if n not in obs}
-        )
-        faults += int(observed["faults"].sum())
-        if not env.agents:
-            ends.append(bool(observed["terminated"]))
-            play.same({n: expected[f"final_{n}"] for n in obs}, {n: observed[n] for n in obs})
-            observed = play.single(env, env.reset())
-    assert len(ends) >= 2
-    assert faults > 0
+    steps = list(both(batch, env, e, LAST_SEED + e, play, steps=140))
+    assert sum(bool(step["terminated"] | step["truncated"]) for step in steps) >= 2
+    assert sum(int(step["faults"].sum()) for step in steps) > 0
 
 
 @examples(25)
@@ -376,11 +353,11 @@ def test_a_shift_as_arrays_has_the_jobs_of_the_scenario(fleet, seed) -> None:
 
 def test_policies_are_compared_on_the_shifts_that_run_plays(cell, plans) -> None:
     fleets = [prepare(cell, difficulty="blind", randomise=each, cache=plans) for each in (None, VARIED)]
-    rewards = [[outcome.reward for outcome in outcomes(fleet, "wspt", range(6))] for fleet in fleets]
+    rewards = [[outcome.reward for outcome in outcomes(fleet, "wspt", range(3))] for fleet in fleets]
     for fleet, expected in zip(fleets, rewards, strict=True):
-        specs = [RunSpec(policy="wspt", seed=seed, bus="memory", difficulty="blind") for seed in range(6)]
+        specs = [RunSpec(policy="wspt", seed=seed, bus="memory", difficulty="blind") for seed in range(3)]
         assert [run(fleet, spec, record=False).reward for spec in specs] == pytest.approx(expected)
-    assert sum(one != other for one, other in zip(*rewards, strict=True)) == 6
+    assert sum(one != other for one, other in zip(*rewards, strict=True)) == 3
 
 
 def test_an_empty_randomisation_changes_nothing(fleet) -> None:
@@ -393,21 +370,21 @@ def test_an_empty_randomisation_changes_nothing(fleet) -> None:
 def test_randomised_values_cover_their_range(fleet) -> None:
     randomise = Randomisation(ambient_k=(-2.0, 6.0), arrivals=(0.5, 2.0))
     library = library_of(replace(fleet, randomise=randomise, variants=(fleet, fleet)))
-    shifts = [library.draw(np.random.SeedSequence(seed)) for seed in range(300)]
+    shifts = [library.draw(np.random.SeedSequence(seed)) for seed in range(200)]
     offset_k = np.array([shift.ambient_offset_k for shift in shifts])
     assert -2.0 <= offset_k.min() < -1.8
     assert 5.8 < offset_k.max() <= 6.0
-    assert offset_k.mean() == pytest.approx(2.0, abs=4 * 8.0 / np.sqrt(12 * 300))
+    assert offset_k.mean() == pytest.approx(2.0, abs=4 * 8.0 / np.sqrt(12 * 200))
     fleets = np.bincount([shift.fleet for shift in shifts], minlength=3)
     assert len(fleets) == 3
-    assert np.abs(fleets - 100).max() < 4 * np.sqrt(300 * 2 / 9)
+    assert np.abs(fleets - 200 / 3).max() < 4 * np.sqrt(200 * 2 / 9)
     # 240 s / 60 s + 200 s / 40 s = 9 jobs, times 1.25 on average, and 3 at once.
     often = Randomisation(arrivals=(3.0, 3.0))
     for chosen, expected in ((Randomisation(), 12.0), (randomise, 3 + 9 * 1.25), (often, 3 + 9 * 3.0)):
         counts = [
-            len(library_of(replace(fleet, randomise=chosen)).draw(np.random.SeedSequence(s)).kind) for s in range(200)
+            len(library_of(replace(fleet, randomise=chosen)).draw(np.random.SeedSequence(s)).kind) for s in range(100)
         ]
-        assert np.mean(counts) == pytest.approx(expected, abs=4 * np.std(counts) / np.sqrt(200))
+        assert np.mean(counts) == pytest.approx(expected, abs=4 * np.std(counts) / np.sqrt(100))
 
 
 def test_randomisation_depends_on_the_seed_and_not_on_noise(fleet, play) -> None:
@@ -494,8 +471,5 @@ def test_variants_with_different_risk_models_do_not_mix(small, play) -> None:
         in_all = replace(shifts[fleet], fleet=fleet)
         alone = BatchEnv(Library(names, 4, own_tables, lambda _, fleet=fleet: shifts[fleet]), 1, seed=0)
         among = BatchEnv(Library(names, 4, together, lambda _, shift=in_all: shift), 1, seed=0)
-        one, other = alone.reset(), among.reset()
-        for step in range(40):
-            play.same(play.rows(one, 0), play.rows(other, 0))
-            actions = actions_of(play, one[0]["action_mask"], step)
-            one, other = alone.step(actions), among.step(actions)
+        for one, other in zip(played(alone, play, [0], 40), played(among, play, [0], 40), strict=True):
+            play.same(one, other)

@@ -30,23 +30,22 @@ MOUNTS = {
 joints = arrays(float, 7, elements=st.floats(-2.0, 2.0))
 
 
-def test_mass_is_that_of_the_gen3():
-    """8.188 kg: sum of the link masses of Kinova's URDF."""
+def test_masses_ranges_lengths_and_rotors_are_those_of_kinova():
+    """By the URDF: 8.188 kg; 0.28481 m to joint 2 and 0.42076 m on to joint 4; by the data sheet: a reach of 902 mm,
+    gear ratio 100, rotors of 0.40e-4 and 0.22e-4 kg·m². Friction is the motor law's business."""
     assert FLOOR.model.body_mass.sum() == pytest.approx(8.188, abs=1e-3)
-
-
-def test_ranges_are_those_of_the_urdf():
     expected = np.full((7, 2), (-np.inf, np.inf))
     expected[[1, 3, 5], 1] = 2.24, 2.57, 2.09
     expected[[1, 3, 5], 0] = -2.24, -2.57, -2.09
     np.testing.assert_array_equal(FLOOR.position_range, expected)
-
-
-def test_reach_from_joint_2_is_902_mm():
     position, turn = FLOOR.tool_pose(np.array(POSTURES["outstretched"]))
     shoulder = FLOOR.data.xpos[FLOOR.model.body("arm_0/half_arm_1").id]
     assert np.linalg.norm(position - shoulder) == pytest.approx(0.902, abs=1.5e-3)
     np.testing.assert_allclose(turn[:, 2], (1.0, 0.0, 0.0), atol=1e-7)
+    assert FLOOR.elbow_position(np.zeros(7))[2] == pytest.approx(0.70557, abs=1e-4)
+    np.testing.assert_allclose(FLOOR.model.dof_armature, [100**2 * 0.40e-4] * 4 + [100**2 * 0.22e-4] * 3)
+    assert not FLOOR.model.dof_damping.any()
+    assert not FLOOR.model.dof_frictionloss.any()
 
 
 # |tau| of J2, J4, J6, N·m, with the payload as a point mass at the flange; computed from Kinova's masses.
@@ -137,18 +136,6 @@ def test_payload_may_change_from_sample_to_sample():
     np.testing.assert_array_equal(FLOOR.gravity_torque(q[0]), tau[0])
     FLOOR.gravity_torque(q[0], 5.0)
     assert FLOOR.model.body_mass.sum() == pytest.approx(8.188, abs=1e-3)
-
-
-def test_joints_carry_their_rotors_and_no_friction():
-    """Gear ratio 100, rotors of 0.40e-4 and 0.22e-4 kg·m²; friction is the motor law's business."""
-    np.testing.assert_allclose(FLOOR.model.dof_armature, [100**2 * 0.40e-4] * 4 + [100**2 * 0.22e-4] * 3)
-    assert not FLOOR.model.dof_damping.any()
-    assert not FLOOR.model.dof_frictionloss.any()
-
-
-def test_the_elbow_of_an_upright_arm_is_705_mm_over_the_base():
-    """0.28481 m to joint 2 and 0.42076 m to joint 4 (URDF)."""
-    assert FLOOR.elbow_position(np.zeros(7))[2] == pytest.approx(0.70557, abs=1e-4)
 
 
 def test_a_cell_holds_all_arms_stations_and_servos():

@@ -57,8 +57,9 @@ def peaks_c(plans, ambient_c=23.0):
     )
 
 
-def test_it_leaves_home_cycles_and_comes_home_without_a_jump(arm):
-    plan = plan_motion(arm, np.stack([NEAR, FAR]), dwell_s=0.5, payload_kg=1.0, speed=0.6)
+def test_it_leaves_home_carries_between_its_places_and_comes_home_without_a_jump(arm):
+    """Second method for the places: MuJoCo's own kinematics against the rotation rebuilt from the place's angles."""
+    plan = plan_motion(arm, np.stack([NEAR, FAR]), dwell_s=[0.4, 1.0], payload_kg=2.0, speed=0.6)
     approach, cycle, retreat = (phase.profile for phase in plan.phases)
     q = np.concatenate([part[:, 0] for part in (approach, cycle, cycle, retreat)])
     step = np.abs(np.diff(q, axis=0)).max(axis=0)
@@ -68,6 +69,18 @@ def test_it_leaves_home_cycles_and_comes_home_without_a_jump(arm):
     assert approach[0, 0] == pytest.approx(ROBOT.home_q(), abs=1e-6)
     assert cycle[0, 0] == pytest.approx(NEAR, abs=1e-6)
     assert retreat[0, 0] == pytest.approx(NEAR, abs=1e-6)
+    carried = plan.cycle.payload_kg  # from the first dwell to the last
+    assert (carried[:20] == 0).all()
+    assert carried[20] == 2.0
+    changes = np.flatnonzero(np.diff(carried)) + 1
+    assert len(changes) == 2
+    assert cycle[changes[1], 0] == pytest.approx(FAR, abs=1e-6)
+    assert not plan.approach.payload_kg.any()
+    assert not plan.retreat.payload_kg.any()
+    for place, posture in zip(plan.work.places, (NEAR, FAR), strict=True):
+        position, turned = arm.tool_pose(posture)
+        assert place.position_m == pytest.approx(position, abs=1e-9)
+        assert rotation(place.tool_deg) == pytest.approx(turned, abs=1e-9)
 
 
 def test_the_torque_is_that_of_the_motion_with_its_payload(arm):
@@ -90,18 +103,6 @@ def test_the_torque_is_that_of_the_motion_with_its_payload(arm):
         mujoco.mj_setConst(arm.model, arm.data)
 
 
-def test_the_payload_hangs_from_the_first_dwell_to_the_last(arm):
-    plan = plan_motion(arm, np.stack([NEAR, FAR]), dwell_s=[0.4, 1.0], payload_kg=2.0, speed=1.0)
-    carried = plan.cycle.payload_kg
-    assert (carried[:20] == 0).all()
-    assert carried[20] == 2.0
-    changes = np.flatnonzero(np.diff(carried)) + 1
-    assert len(changes) == 2
-    assert plan.cycle.profile[changes[1], 0] == pytest.approx(FAR, abs=1e-6)
-    assert not plan.approach.payload_kg.any()
-    assert not plan.retreat.payload_kg.any()
-
-
 def test_one_stop_is_a_hold_under_the_gravity_of_its_load(arm):
     plan = plan_motion(arm, FAR[None], dwell_s=20.0, payload_kg=3.0, speed=1.0, name="wait")
     assert plan.work.kind == "hold"
@@ -109,15 +110,6 @@ def test_one_stop_is_a_hold_under_the_gravity_of_its_load(arm):
     assert not plan.cycle.profile[:, 1].any()
     assert plan.cycle.profile[0, 2] == pytest.approx(arm.gravity_torque(FAR, 3.0), abs=1e-4)
     assert plan.work.places[0].name == "wait/stop_1"
-
-
-def test_places_are_where_the_tool_really_is(arm):
-    """Second method: MuJoCo's own kinematics against the rotation rebuilt from the place's angles."""
-    plan = plan_motion(arm, np.stack([NEAR, FAR]), dwell_s=0.5, payload_kg=1.0, speed=1.0)
-    for place, q in zip(plan.work.places, (NEAR, FAR), strict=True):
-        position, turned = arm.tool_pose(q)
-        assert place.position_m == pytest.approx(position, abs=1e-9)
-        assert rotation(place.tool_deg) == pytest.approx(turned, abs=1e-9)
 
 
 @given(st.tuples(st.floats(-180, 180), st.floats(-180, 180) | st.sampled_from([90.0, -90.0]), st.floats(-180, 180)))
@@ -299,11 +291,11 @@ def test_the_tool_counts_and_an_arm_may_have_a_lower_limit():
 
 def test_a_load_that_is_carried_far_out_between_two_near_places_counts_there(planner):
     """The rating holds along the way, not only at the places: from 30° left to 30° right the tool stays as far out."""
-    near = place(0.6)
     turned = tuple(
-        Place(name=n, position_m=_turned(near.position_m, a), tool_deg=(0.0, 90.0, a))
-        for n, a in (("left", 30.0), ("right", -30.0))
-    )
+        replace(place(0.6), name=name, position_m=tuple(rotation((0.0, 0.0, deg)) @ place(0.6).position_m),
+                tool_deg=(0.0, 90.0, deg))
+        for name, deg in (("left", 30.0), ("right", -30.0))
+    )  # fmt: skip
     slow = Work(kind="pick_place", places=turned, payload_kg=3.5, dwell_s=130.0)
     with pytest.raises(InfeasibleJob, match="beyond the rating of 3"):
         planner.plan(slow)
@@ -320,9 +312,3 @@ def test_a_cached_plan_does_not_outlive_a_lower_limit(tmp_path):
 def test_a_heavier_tool_than_the_rating_is_refused():
     with pytest.raises(ValueError, match=r"Robot\.tool_kg must be at most 4\.5"):
         Robot(name="a", tool_kg=4.6)
-
-
-def _turned(position_m, degrees):
-    x, y, z = position_m
-    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
-    return (c * x - s * y, s * x + c * y, z)

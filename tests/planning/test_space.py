@@ -207,7 +207,7 @@ def test_links_are_as_far_apart_as_mujoco_says(robots, capsules):
                     assert ours_m <= true_m + 1e-5  # a capsule around a cylinder or box
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_the_tree_finds_the_closest_of_all_pairs_of_postures(capsules, seed):
     one, other = (c.sweep(path(2 * seed + n, 50), payload_kg=2.0) for n, c in enumerate(capsules))
     closest = min(
@@ -254,7 +254,6 @@ WORKS = {
 
 
 def table_of(top_m: float) -> Fixture:
-    """A table under the places."""
     return Fixture(name="table", position_m=(0.45, 0.0, top_m / 2), size_m=(0.3, 1.0, top_m))
 
 
@@ -278,7 +277,7 @@ def test_a_mass_beyond_the_largest_ball_has_its_size():
     assert payload_radius_m(0.0) == 0.0
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(5))
 def test_a_clear_path_stays_clear_of_thin_fixtures_between_the_checked_postures(seed):
     """Second method: a tenth of the step, with every link against a sheet of 5 mm in a random place."""
     rng = np.random.default_rng(seed)

@@ -63,8 +63,8 @@ def records() -> list[np.ndarray]:
 
 @pytest.fixture(scope="session")
 def small() -> TwinConfig:
-    """A configuration that trains seven joints in about two seconds."""
-    return TwinConfig(hidden=16, max_windows=384, epochs=40, batch=64, restarts=1)
+    """A configuration that trains seven joints in about a second."""
+    return TwinConfig(hidden=16, max_windows=384, epochs=25, batch=64, restarts=1)
 
 
 @pytest.fixture(scope="session")
@@ -74,8 +74,6 @@ def twin(records: list[np.ndarray], small: TwinConfig) -> Twin:
 
 @pytest.fixture(scope="session")
 def recording_of() -> Callable[[float], Recording]:
-    """A recording of smooth motion that lasts some seconds."""
-
     def make(seconds: float) -> Recording:
         q, qd, tau = smooth_motion(np.random.default_rng(3), seconds).astype(float).swapaxes(0, 1)
         return Recording(name="log", time_s=np.arange(len(q)) / RATE_HZ, q=q, qd=qd, tau=tau)

@@ -30,7 +30,6 @@ CYCLE_S = 40.0
 
 
 def held(tau: np.ndarray, seconds: float = CYCLE_S) -> Recording:
-    """A posture held, 2 samples a second."""
     time_s = np.arange(0.0, seconds + 0.25, 0.5)
     still = np.zeros((len(time_s), JOINTS))
     return Recording(name="hold", time_s=time_s, q=still, qd=still, tau=still + tau)
@@ -62,7 +61,7 @@ def hour() -> tuple[RcTwin, Recording, np.ndarray, ThermalForecast]:
 
 def test_arms_unlike_the_nominal_one_end_in_the_intervals_near_the_median() -> None:
     inside, error_k, change_k = [], [], []
-    for seed in range(6):
+    for seed in range(4):
         arm = true_arm(seed)
         log, nodes = working(arm, 40.0, np.random.default_rng(seed))
         low, median, high = (each[-1] for each in forecast(log, held(FULL_REACH_NM), 30).interval())
@@ -91,7 +90,7 @@ def test_intervals_hold_95_percent_of_the_ends_of_arms_that_vary_as_assumed() ->
         **about,
     )
     inside = []
-    for _ in range(16):
+    for _ in range(9):
         x = vector.mean + np.hypot(sd, FROM_LOG_TO_LOG) * rng.standard_normal(len(vector))
         arm = RcTwin(arm="own", heat_model=vector.heat_model(x), ambient_c=AIR_C, base="true")
         log, nodes = working(arm, 10.0, rng)
@@ -99,7 +98,7 @@ def test_intervals_hold_95_percent_of_the_ends_of_arms_that_vary_as_assumed() ->
         end_c = course(warmer, nodes[-1], FULL_REACH_NM, 20 * CYCLE_S)[-1, :JOINTS]
         low, _, high = (each[-1] for each in forecast(log, held(FULL_REACH_NM), 20, network=network).interval())
         inside.append((low <= end_c) & (end_c <= high))
-    # 112 ends, of which those of an arm are correlated.
+    # 63 ends, of which those of an arm are correlated.
     assert 0.9 <= np.mean(inside) <= 0.99
 
 
@@ -138,25 +137,22 @@ def test_the_longest_run_is_that_whose_own_forecast_is_just_safe(hour) -> None:
 
 
 def test_an_arm_that_starts_warmer_by_the_safe_change_just_stays_below_the_limit(hour) -> None:
-    arm, _, start_c, found = hour
+    """No start is safe if a cold arm gets there too."""
+    arm, log, start_c, found = hour
     limit_c = float(found.interval()[1].max()) + 3.0
     more_k = found.safe_start_k(limit_c)
     peak_c = [course(arm, start_c + k, FULL_REACH_NM, found.run_s)[:, :JOINTS].max() for k in (more_k, more_k + 3.0)]
     assert peak_c[0] < limit_c < peak_c[1]
-
-
-def test_no_start_is_safe_if_a_cold_arm_gets_there_too(hour) -> None:
-    _, log, _, _ = hour
-    endless = forecast(log, held(2.0 * FULL_REACH_NM), 1000, ambient_c=AIR_C)
+    endless = forecast(log, held(2.0 * FULL_REACH_NM), 300, ambient_c=AIR_C)
     assert endless.safe_start_k(60.0) == -np.inf
 
 
 def test_a_longer_run_is_never_safer_and_keeps_the_peaks_of_short_bursts(hour) -> None:
-    """A quarter of an hour with a burst of 20 s: P(limit) of 200 repetitions is not below that of 16."""
+    """A quarter of an hour with a burst of 20 s: P(limit) of 100 repetitions is not below that of 16."""
     _, log, _, _ = hour
     plan = held(np.zeros(JOINTS), 900.0)
     plan.tau[:40] = 1.6 * FULL_REACH_NM
-    few, many = (forecast(log, plan, n, ambient_c=AIR_C) for n in (16, 200))
+    few, many = (forecast(log, plan, n, ambient_c=AIR_C) for n in (16, 100))
     limit_c = float(np.median(few.interval()[1].max()))
     assert many.probability(limit_c) >= few.probability(limit_c) > 0.0
     for found in (few, many):
@@ -173,8 +169,14 @@ def test_the_same_seed_gives_the_same_forecast_and_short_cycles_that_of_long_one
     np.testing.assert_allclose(short.interval()[1][-1], found.interval()[1][-1], atol=0.02)
 
 
-def test_a_plan_at_rest_stays_and_late_rows_of_a_moving_one_are_left_out(hour) -> None:
-    log = hour[1]
+@pytest.fixture
+def few_samples(monkeypatch) -> None:
+    """For a test that reads neither a probability nor an interval."""
+    monkeypatch.setattr("twin.thermal.forecast.SAMPLES", 20)
+
+
+def test_a_plan_at_rest_stays_and_late_rows_of_a_moving_one_are_left_out(hour, few_samples) -> None:
+    _, log, _, _ = hour
     hold = held(FULL_REACH_NM)
     warm = replace(hold, temp_c=np.full((len(hold.time_s), JOINTS), 30.0))
     assert (forecast(log, warm, 5).sampled_c == forecast(log, hold, 5).sampled_c).all()
@@ -191,7 +193,7 @@ def test_a_plan_at_rest_stays_and_late_rows_of_a_moving_one_are_left_out(hour) -
     assert abs(late_c - true_c) < 0.6 * (held_on_c - true_c)
 
 
-def test_temperatures_of_other_joints_and_other_currents_are_told(hour) -> None:
+def test_temperatures_of_other_joints_and_other_currents_are_told(hour, few_samples) -> None:
     """Without a word, joint 2 would end 30 K too cool; with half the currents, hundreds of kelvin too hot."""
     _, log, _, found = hour
     assert log.temp_c is not None

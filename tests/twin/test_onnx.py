@@ -39,11 +39,11 @@ def exported(twin, tmp_path_factory):
     return export_onnx(twin, tmp_path_factory.mktemp("out") / "arm_0")
 
 
-@pytest.mark.parametrize("count", [1, 2, 9])
 @pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_onnxruntime_says_what_the_twin_says(twin, exported, rng, motion, count, precision, tmp_path):
+def test_onnxruntime_says_what_the_twin_says(twin, exported, rng, motion, precision, tmp_path):
     path = exported if precision == "float32" else export_onnx(twin, tmp_path / "double.onnx", precision)
-    assert_parity(twin, path, windows(rng, motion, count), precision)
+    for count in (1, 2, 9):
+        assert_parity(twin, path, windows(rng, motion, count), precision)
 
 
 def test_no_windows_have_no_scores(exported):

@@ -16,23 +16,13 @@ from fleet.errors import FleetError
 from twin.logs.recording import NothingCool, Recording, cool_stretches
 from twin.vae.config import LOGVAR_RANGE, TwinConfig, hash_records, seed_text, training_key
 from twin.vae.inference import tanh
-from twin.vae.model import active_units, build, collapsed, kl, negative_elbo, one_thread, reconstruction
+from twin.vae.model import active_units, build, collapsed, kl, negative_elbo, one_thread
 from twin.vae.train import CollapsedPosterior, Diverged, Run, SideBySide, train
-from twin.vae.window import STD_FLOOR, Scaler, cover, cut, resample, starts, windows_of
+from twin.vae.window import STD_FLOOR, Scaler, cover, cut, resample, windows_of
 
 lengths = st.integers(1, 300)
 windows = st.integers(2, 60)
 rates = st.sampled_from([2.0, 10.0, 12.5, 33.0, 50.0, 120.0])
-
-
-@given(lengths, windows, st.data())
-def test_windows_cover_every_sample_and_nothing_beyond(length, window, data):
-    stride = data.draw(st.integers(1, window))
-    first = starts(length, window, stride)
-    seen = {i for s in first for i in range(s, s + window)}
-    assert set(range(length)) <= seen
-    assert len(set(first)) == len(first)
-    assert first[-1] == max(length - window, 0)
 
 
 @given(lengths, windows, st.data())
@@ -126,20 +116,11 @@ def test_records_that_cannot_teach_are_refused(rng, motion, tiny):
 def test_shapes_and_the_range_of_the_log_variance(latent, layers):
     net = build(TwinConfig(latent=latent, hidden=8, layers=layers), seed=0)
     x_hat, mu, logvar = net(torch.zeros(4, 50, 3), torch.zeros(4, latent))
-    assert x_hat.shape == (4, 50, 3)
-    assert mu.shape == logvar.shape == (4, latent)
+    assert (x_hat.shape, mu.shape, logvar.shape) == ((4, 50, 3), (4, latent), (4, latent))
     with torch.no_grad():
         net.logvar.bias.copy_(100.0 * (-1.0) ** torch.arange(latent))
         _, logvar = net.encode(torch.randn(3, 50, 3))
     assert logvar.unique().tolist() == sorted(LOGVAR_RANGE)[-min(latent, 2) :]
-
-
-def test_building_leaves_the_global_random_state_alone():
-    before = torch.random.get_rng_state()
-    first, second, other = build(TwinConfig(), 5), build(TwinConfig(), 5), build(TwinConfig(), 6)
-    assert torch.equal(before, torch.random.get_rng_state())
-    assert torch.equal(first.mu.weight, second.mu.weight)
-    assert not torch.equal(first.mu.weight, other.mu.weight)
 
 
 def test_one_thread_gives_the_threads_back_even_after_an_error():
@@ -170,7 +151,6 @@ def test_one_thread_gives_the_threads_back_even_after_an_error():
         ({"window": 20, "stride": 30}, "never seen"),
         ({"beta": -1.0}, "beta must be 0 to 1000"),
         ({"noise": (0.1, -0.1, 0.1)}, "noise must be three"),
-        ({"noise": (0.1, 0.1)}, "noise must be three"),
     ],
 )
 def test_a_configuration_that_cannot_be_is_refused(change, words):
@@ -178,9 +158,7 @@ def test_a_configuration_that_cannot_be_is_refused(change, words):
         TwinConfig(**change)
 
 
-def test_quick_trains_less_and_a_seed_reads_as_entropy_and_spawn_key():
-    quick, full = TwinConfig.quick(), TwinConfig()
-    assert quick.max_windows * quick.epochs * quick.restarts < full.max_windows * full.epochs * full.restarts / 4
+def test_a_seed_reads_as_entropy_and_spawn_key():
     assert seed_text(np.random.SeedSequence(5, spawn_key=(1, 2))) == "5/1.2"
 
 
@@ -208,12 +186,6 @@ def test_a_latent_that_never_moves_is_not_active_and_none_or_little_kl_counts_as
     assert [collapsed(0.4, 1), collapsed(3.0, 0), collapsed(0.6, 1)] == [True, True, False]
 
 
-def test_reconstruction_is_the_gaussian_log_likelihood_up_to_its_constant():
-    x, x_hat = torch.randn(6, 2, 3, 4, generator=DRAW), torch.randn(6, 2, 3, 4, generator=DRAW)
-    log_p = Normal(x_hat, 1.0).log_prob(x).sum((0, 2))
-    torch.testing.assert_close(-reconstruction(x, x_hat) - 18 * 0.5 * np.log(2 * np.pi), log_p)
-
-
 SEED = np.random.SeedSequence(11)
 
 
@@ -230,17 +202,19 @@ def test_the_twin_knows_its_training_better_than_their_mean(twin):
 
 
 def test_a_seed_gives_the_same_weights_and_leaves_global_states_alone(records, tiny):
-    first = train(records, tiny, SEED, arm="a")
+    before, threads, progress = torch.random.get_rng_state(), torch.get_num_threads(), list[float]()
+    first = train(records, tiny, SEED, arm="a", progress=progress.append)
+    assert torch.equal(before, torch.random.get_rng_state())
+    assert torch.get_num_threads() == threads
     assert first.data_hash == hash_records(records)
+    assert progress == sorted(progress)
+    assert progress[-1] == pytest.approx(1.0)
+    assert len(progress) == 3  # epochs, each of all joints and restarts together
     again = train(records, tiny, SEED, arm="a")
     other = train(records, tiny, np.random.SeedSequence(12), arm="a")
     assert first.version == again.version != other.version
     for name, tensor in first.tensors().items():
         np.testing.assert_array_equal(tensor, again.tensors()[name])
-    before, threads = torch.random.get_rng_state(), torch.get_num_threads()
-    train(records, tiny, SEED, arm="a")
-    assert torch.equal(before, torch.random.get_rng_state())
-    assert torch.get_num_threads() == threads
 
 
 @pytest.mark.slow
@@ -266,20 +240,14 @@ def test_the_restart_that_is_ahead_after_the_trial_is_trained_to_the_end(records
 def test_more_windows_than_wanted_are_drawn_without_bias(records, tiny):
     rising = [record + np.float32(i) for i, record in enumerate(records)]
     means = [
-        train(rising, replace(tiny, epochs=1, restarts=1), np.random.SeedSequence(s), arm="a").scaler.mean[1, 0]
+        train(rising, replace(tiny, hidden=2, epochs=1, restarts=1), np.random.SeedSequence(s), arm="a").scaler.mean[
+            1, 0
+        ]
         for s in range(6)
     ]
     of_64 = np.std(np.arange(60)) / np.sqrt(64)
     assert np.std(means) > 0.2 * of_64
     np.testing.assert_allclose(np.mean(means), np.mean(rising, axis=(0, 1))[0, 1], atol=4 * of_64 / np.sqrt(6))
-
-
-def test_progress_rises_to_one(records, tiny):
-    told: list[float] = []
-    train(records[:4], tiny, SEED, arm="a", progress=told.append)
-    assert told == sorted(told)
-    assert told[-1] == pytest.approx(1.0)
-    assert len(told) == 3  # epochs, each of all joints and restarts together
 
 
 def test_a_collapsed_posterior_is_an_error_with_advice(records, small):
@@ -296,7 +264,7 @@ def test_a_joint_that_stood_still_may_have_nothing_to_say(records, small):
     held = [record.copy() for record in records]
     for record in held:
         record[:, :, 4:] = record[0, :, 4:] = 0.5
-    twin = train(held, replace(small, epochs=25, noise=(0.0, 0.0, 0.0)), SEED, arm="a")
+    twin = train(held, replace(small, epochs=15, noise=(0.0, 0.0, 0.0)), SEED, arm="a")
     assert twin.scaler.still.tolist() == [False] * 4 + [True] * 3
 
 
@@ -320,7 +288,7 @@ def test_the_key_changes_with_data_configuration_and_seed(records, tiny):
 
 
 def test_one_network_can_know_the_whole_arm(records, small):
-    config = replace(small, scope="arm", latent=8, hidden=32)
+    config = replace(small, scope="arm", latent=8, hidden=32, epochs=20)
     twin = train(records, config, SEED, arm="a")
     assert len(twin.nets) == len(twin.fits) == 1
     assert {name.split(".")[0] for name in twin.tensors()} == {"arm"}
@@ -330,7 +298,7 @@ def test_one_network_can_know_the_whole_arm(records, small):
 
 
 def test_an_autoencoder_has_no_posterior_and_is_watched_by_its_units(records, small):
-    twin = train(records, replace(small, kind="ae"), SEED, arm="a")
+    twin = train(records, replace(small, kind="ae", epochs=10), SEED, arm="a")
     assert not any("logvar" in name for name in twin.tensors())
     for fit in twin.fits:
         assert fit.kl == 0.0
@@ -384,33 +352,33 @@ def test_motors_that_do_not_count_may_be_warm():
     assert [len(s.time_s) for s in cool_stretches([idle], 1.0, cool_c=40.0, joints=[1])] == [100]
 
 
-def test_hot_recordings_are_refused_with_advice():
-    hot = [warmed(np.full(100, 50.0))]
-    words = r"^At no moment of 2 recording.*motors 2, 3 stay below 40 °C for the rest.*2 \(50.0 °C\).*Raise the limit"
-    with pytest.raises(NothingCool, match=words):
-        cool_stretches(hot * 2, 1.0, cool_c=40.0, joints=[1, 2])
-    with pytest.raises(ValueError, match="at least one recording"):
-        cool_stretches([], 1.0, cool_c=40.0, joints=[1])
+LATE_PEAK_C = np.full(100, 35.0)
+LATE_PEAK_C[87] = 50.0
+NO_HEAT = {name: getattr(warmed(np.full(10, 30.0)), name) for name in ("time_s", "q", "qd", "tau")}
+REFUSED = {
+    "hot": (
+        [warmed(np.full(100, 50.0))] * 2, {"joints": [1, 2]},
+        r"^At no moment of 2 recording.*motors 2, 3 stay below 40 °C for the rest.*2 \(50.0 °C\).*Raise the limit",
+    ),
+    "short": (
+        [warmed(np.full(10, 30.0))] * 2, {"least_s": 25.0},
+        r"^The recording is shorter .* 25 s are needed, the longest .* has 10 s\.",
+    ),
+    "short part": (
+        [warmed(LATE_PEAK_C)], {"least_s": 25.0},
+        r"^The part that stays cool is shorter .* 25 s are needed, the longest .* has 12 s\.",
+    ),
+    "none": ([], {}, "at least one recording"),
+    "no such joint": ([warmed(np.full(10, 30.0))], {"joints": [7]}, "some of 0 … 6"),
+    "no temperatures": ([Recording(name="blind", **NO_HEAT)], {}, "'blind' has no motor temperatures"),
+}  # fmt: skip
 
 
-def test_a_short_recording_is_not_reported_as_hot():
-    with pytest.raises(NothingCool, match=r"^The recording is shorter .* 25 s are needed, the longest .* has 10 s\."):
-        cool_stretches([warmed(np.full(10, 30.0))] * 2, 1.0, cool_c=40.0, joints=[1], least_s=25.0)
-    temp_c = np.full(100, 35.0)
-    temp_c[87] = 50.0
-    words = r"^The part that stays cool is shorter .* 25 s are needed, the longest .* has 12 s\."
-    with pytest.raises(NothingCool, match=words):
-        cool_stretches([warmed(temp_c)], 1.0, cool_c=40.0, joints=[1], least_s=25.0)
-
-
-def test_bad_arguments_are_named():
-    recording = warmed(np.full(10, 30.0))
-    with pytest.raises(ValueError, match="some of 0 … 6"):
-        cool_stretches([recording], 1.0, cool_c=40.0, joints=[7])
-    still = recording.q
-    blind = Recording(name="blind", time_s=recording.time_s, q=still, qd=still, tau=still)
-    with pytest.raises(ValueError, match="'blind' has no motor temperatures"):
-        cool_stretches([blind], 1.0, cool_c=40.0, joints=[1])
+@pytest.mark.parametrize("name", REFUSED)
+def test_recordings_without_a_cool_part_are_refused_with_the_reason(name):
+    recordings, options, words = REFUSED[name]
+    with pytest.raises((NothingCool, ValueError), match=words):
+        cool_stretches(recordings, 1.0, cool_c=40.0, **{"joints": [1], **options})
 
 
 def drawn(seed: int, *shape: int) -> torch.Tensor:
