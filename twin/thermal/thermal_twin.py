@@ -237,13 +237,6 @@ class RcTwin:
         """Steady temperatures of the powered arm without load, °C, [node]."""
         return self.thermal.steady(node_heat(np.zeros(JOINTS), self.motors.idle_w), self.ambient_c)
 
-    def likely_start(self, temp_c: Array) -> Array:
-        """Node temperatures for measured motor temperatures, °C, [..., joint] to [..., node].
-
-        Housings have no sensor and count as warm as their windings: true after minutes of rest, cautious after work.
-        """
-        return np.concatenate([temp_c, temp_c], axis=-1)
-
     def score(self, plan: Plan, repetitions: int) -> Difficulty:
         """Difficulty of the repeated plan, and its peak as a function of the temperatures at the start.
 
@@ -261,7 +254,7 @@ class RcTwin:
         """Hottest temperature of each motor during each job, °C, [plan, joint].
 
         Args:
-            start_c: [node], or [plan, node]; `likely_start` makes it from measured temperatures.
+            start_c: [node], or [plan, node].
         """
         self._check(plans, repetitions)
         square, friction = np.zeros((2, len(plans), JOINTS))
@@ -286,29 +279,6 @@ class RcTwin:
             ambient_c=self.ambient_c,
         )
         return np.stack(list(rows))
-
-    def predict(self, plan: Plan, repetitions: int, start_c: Array) -> tuple[Array, Array]:
-        """Motor temperatures during a job: approach, cycles and retreat, each with its own mean heat.
-
-        Args:
-            start_c: Measured motor temperatures [joint], or estimates of all nodes [node].
-
-        Returns:
-            Time since the start, s, [time], and temperatures, °C, [time, joint].
-        """
-        self._check([plan], [repetitions])
-        temp = self.likely_start(start_c) if len(start_c) == JOINTS else np.asarray(start_c, dtype=float)
-        if temp.shape != (NODES,):
-            raise ValueError(f"start_c must be [{JOINTS}] or [{NODES}] (got shape {np.shape(start_c)}).")
-        times, temps, now_s = [np.zeros(1)], [temp[None]], 0.0
-        for phase, count in zip(plan.phases, (1, repetitions, 1), strict=True):
-            lasts_s = phase.duration_s * count
-            if lasts_s > 0:
-                part = self.simulate(drives([phase.profile], self.motors), np.array([lasts_s]), temps[-1][-1])[:, 0]
-                times.append(now_s + lasts_s * np.arange(1, len(part)) / (len(part) - 1))
-                temps.append(part[1:])
-                now_s += lasts_s
-        return np.concatenate(times), np.concatenate(temps)[:, WINDING]
 
     def peak(self, plan: Plan, repetitions: int) -> Forecast:
         """Hottest motor during a job, °C, from the temperatures at its start; with the curve to P(saturation)."""
