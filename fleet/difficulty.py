@@ -176,11 +176,11 @@ def extend_curve(curve: Array, knots: int) -> Array:
     """
     more = knots - curve.shape[1]
     if not len(curve):
-        return np.zeros((0, knots, 2))
+        return np.zeros((0, knots, 2), curve.dtype)
     if not more:
         return curve
     if not curve.shape[1]:
-        return np.full((len(curve), knots, 2), np.nan)
+        return np.full((len(curve), knots, 2), np.nan, curve.dtype)
     beyond = np.repeat(curve[:, -1:], more, axis=1)
     beyond[..., 0] = np.where(np.isnan(curve[:, :1, 0]), np.nan, np.inf)
     return np.concatenate([curve, beyond], axis=1)

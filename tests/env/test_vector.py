@@ -467,6 +467,8 @@ def test_variants_with_different_risk_models_do_not_mix(small, play) -> None:
     assert [bool(table.excluded.any()) for table in tables] == [False, True, True]
     assert len({int(np.bitwise_count(table.stations).max()) for table in tables}) == 2
     names, together = ("arm_0", "arm_1", "arm_2"), stack_tables(tables)
+    for name, values in together._asdict().items():  # other types would be compiled anew
+        assert np.asarray(values).dtype == np.asarray(getattr(tables[0], name)).dtype, name
     for fleet, own_tables in enumerate(tables):
         in_all = replace(shifts[fleet], fleet=fleet)
         alone = BatchEnv(Library(names, 4, own_tables, lambda _, fleet=fleet: shifts[fleet]), 1, seed=0)
