@@ -86,7 +86,7 @@ def bus(tmp_path, small, monkeypatch):
         def arm(plan=None, body=None, speed=SPEED, clock_s=100.0, limits=LIMITS, warm=True, model=None, **config):
             content = small.work("bench")
             own = small.arm(0, [content])
-            book = stack.enter_context(Journal(tmp_path / "arm_0.jsonl", ArmRecord))
+            book = stack.enter_context(Journal(tmp_path / "arm_0.jsonl", ArmRecord, durable=False))
             history = ArmHistory().replay(book.records()).after_restart("arm_0", 0.0)
             book.rewrite(*history.compact())
             body = body or SimulatedBody(

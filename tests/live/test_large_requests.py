@@ -42,17 +42,6 @@ def test_a_cancelled_job_gives_up_a_long_chain_that_waits_for_it_soon(auctioneer
     assert end.reason == f"Given up, because it waits for '{last - 1}', which is given up or cancelled."
 
 
-def test_many_jobs_that_expire_at_once_give_up_those_that_wait_for_them_soon(auctioneer):
-    for first in range(0, 4000, 60):
-        late = [msgspec.structs.replace(job(f"e{i}"), due_s=9.0, expires=True) for i in range(first, first + 60)]
-        auctioneer.submit(Submission((*late, *(job(f"w{each.name}", each.name) for each in late))), 0.0, 0.0)
-    began_s = time.process_time()
-    auctioneer.tick(0.0, 10.0)
-    assert time.process_time() - began_s < SOON_S
-    assert {status.state for status in auctioneer.status()} == {"given_up"}
-    assert len(auctioneer.status()) + auctioneer.book.left["given_up"] == 8040
-
-
 def ring() -> tuple[JobSpec, ...]:
     names = [f"{i:03}".rjust(128, "é") for i in range(30)]
     return tuple(job(name, before) for name, before in zip(names, names[1:] + names[:1], strict=True))

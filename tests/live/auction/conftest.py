@@ -118,7 +118,7 @@ class Bus:
         with ExitStack() as resources:
             link = resources.enter_context(BusClient(self.endpoint, "f"))
             path = self.folder / folder / name
-            journal = resources.enter_context(Journal[BookRecord](path, BookRecord))
+            journal = resources.enter_context(Journal[BookRecord](path, BookRecord, durable=False))
             node = AuctionNode(link, name, journal, **{"allocate": first_come, "speed": 60.0, **options})
             node.resources = self.stack.enter_context(resources.pop_all())
         self.nodes.append(node)

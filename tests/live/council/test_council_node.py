@@ -70,8 +70,8 @@ def bus(tmp_path, small):
         def arm(name, *, new_epoch=False, **membership):
             own = small.arm(ROSTER.index(name), [small.work(place) for place in PLACES])
             plans = {(work.kind, work.places[0].name): plans for work, plans in own.plans.items()}
-            book = stack.enter_context(Journal(tmp_path / f"{name}.journal", ArmRecord))
-            grants = stack.enter_context(Journal(tmp_path / f"{name}.grants", BookRecord))
+            book = stack.enter_context(Journal(tmp_path / f"{name}.journal", ArmRecord, durable=False))
+            grants = stack.enter_context(Journal(tmp_path / f"{name}.grants", BookRecord, durable=False))
             history = ArmHistory().replay(book.records()).after_restart(name, 0.0)
             book.rewrite(*history.compact())
             link = stack.enter_context(BusClient(router.endpoint, "f"))
