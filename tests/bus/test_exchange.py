@@ -9,7 +9,6 @@ import subprocess
 import sys
 import threading
 import warnings
-from dataclasses import fields, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from hypothesis import strategies as st
 
 from agents.registry import make_policy
 from fleet.bus.exchange.channel import PERFECT, Channel, Partition
-from fleet.bus.exchange.memory import UNHEARD, Broadcast, Delivery, Exchange, PeerView
+from fleet.bus.exchange.memory import UNHEARD, Broadcast, Delivery, Exchange
 from fleet.bus.exchange.zenoh import ZenohExchange, messages_of
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import DifficultyScores, State, decode, encode
@@ -72,12 +71,6 @@ def test_random_places_are_uniform_in_the_unit_square():
     hits = [Channel(topology="random_geometric", radius=r, topology_seed=s).links(arms)[0, 1] for s in range(3000)]
     expected = np.pi * r**2 - 8 / 3 * r**3 + r**4 / 2
     assert abs(np.mean(hits) - expected) < 4 * np.sqrt(expected * (1 - expected) / 3000)
-
-
-def test_a_partition_of_unknown_arms_is_refused():
-    channel = Channel(partitions=(Partition(0.0, 1.0, (("arm_a",),)),))
-    with pytest.raises(ValueError, match=r"A partition names an unknown arm 'arm_a'.*Allowed: a, b"):
-        channel.check(FIVE)
 
 
 def test_a_partition_cuts_what_lies_between_groups_and_those_of_no_group_keep_together():
@@ -278,34 +271,6 @@ FOUR = ("a", "b", "c", "d")
 BIDS = ("duration_s", "peak_c", "p_saturation")
 
 
-def test_scores_go_to_the_slot_of_their_job(make_words):
-    exchange = Exchange(("s", "t"), Channel(delay_s=10.0))
-    words = replace(
-        make_words(np.random.default_rng(0), 2, 0.0, slots=3),
-        jobs=("a", "b", "c"),
-        difficulty=np.array([[1.0, 2.0, 3.0]] * 2),
-        p_saturation=np.array([[[0.1, 0.4], [0.2, 0.5], [0.3, 0.6]]] * 2),
-    )
-    exchange.share(words)
-    later = make_words(np.random.default_rng(1), 2, 10.0, slots=4)
-    heard = exchange.share(replace(later, jobs=("c", "", "x", "a")))
-    np.testing.assert_array_equal(heard.difficulty[0, 1], [3.0, np.nan, np.nan, 1.0])
-    np.testing.assert_array_equal(heard.p_saturation[0, 1], [[0.3, 0.6], [np.nan] * 2, [np.nan] * 2, [0.1, 0.4]])
-
-
-def test_on_a_ring_only_neighbours_are_heard(make_words):
-    exchange = Exchange(FOUR, Channel(topology="ring"))
-    rng = np.random.default_rng(1)
-    heard = [exchange.share(make_words(rng, 4, 10.0 * tick)) for tick in range(3)][-1]
-    across = np.array([[(r - s) % 4 == 2 for s in range(4)] for r in range(4)])
-    assert np.isinf(heard.age_s[across]).all()
-    assert (heard.mode[across] == UNHEARD).all()
-    assert np.isnan(heard.headroom_k[across]).all()
-    assert np.isnan(heard.difficulty[across]).all()
-    assert (heard.age_s[~across] == 0.0).all()
-    assert exchange.delivered == 3 * 8
-
-
 @examples(40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(ticks=st.integers(0, 4), dt_s=st.sampled_from([0.1, 1.0, 10.0]), seed=st.integers(0, 99))
 def test_a_delayed_word_is_the_word_of_then_under_the_names_of_now(make_words, ticks, dt_s, seed):
@@ -322,6 +287,8 @@ def test_a_delayed_word_is_the_word_of_then_under_the_names_of_now(make_words, t
                 then = tick if receiver == sender else tick - ticks
                 if then < 0:
                     assert heard.age_s[receiver, sender] == np.inf
+                    assert heard.mode[receiver, sender] == UNHEARD
+                    assert np.isnan(heard.headroom_k[receiver, sender])
                     assert np.isnan(heard.difficulty[receiver, sender]).all()
                     continue
                 old = said[then]
@@ -336,50 +303,13 @@ def test_a_delayed_word_is_the_word_of_then_under_the_names_of_now(make_words, t
                         np.testing.assert_array_equal(actual, np.broadcast_to(expected, np.shape(actual)))
 
 
-def test_relabelling_the_arms_relabels_what_is_heard(make_words, assert_same):
-    order = [2, 0, 3, 1]
-    rng = np.random.default_rng(5)
-    channel = Channel(delay_s=10.0, partitions=(Partition(10.0, 30.0, (("a", "b"), ("c",))),))
-    plain, turned = Exchange(FOUR, channel), Exchange([FOUR[i] for i in order], channel)
-    for tick in range(5):
-        words = make_words(rng, 4, 10.0 * tick)
-        per_arm = ("mode", "temp_c", "headroom_k", "busy_s", "difficulty", *BIDS)
-        moved = replace(
-            words, **{f: getattr(words, f)[order] for f in per_arm}, twin=tuple(words.twin[i] for i in order)
-        )
-        one, other = plain.share(words), turned.share(moved)
-        assert_same(PeerView(**{f.name: getattr(one, f.name)[np.ix_(order, order)] for f in fields(PeerView)}), other)
-
-
-def test_a_delay_is_not_a_tick_longer_for_a_rounding(make_words):
-    """0.1 + 0.2 > 0.3 in binary."""
-    exchange = Exchange(FOUR, Channel(delay_s=0.2))
-    rng = np.random.default_rng(0)
-    exchange.share(make_words(rng, 4, 0.1))
-    assert np.isfinite(exchange.share(make_words(rng, 4, 0.3)).age_s).all()
-
-
-def test_one_arm_alone_knows_itself(make_words):
-    heard = Exchange(["solo"]).share(make_words(np.random.default_rng(0), 1, 0.0))
-    assert heard.difficulty.shape == (1, 1, 4)
-    assert heard.age_s.tolist() == [[0.0]]
-
-
 def test_an_exchange_that_cannot_be_is_refused(make_words):
-    with pytest.raises(ValueError, match="unknown arm 'z'"):
+    with pytest.raises(ValueError, match=r"A partition names an unknown arm 'z'.*Allowed: a, b, c, d"):
         Exchange(FOUR, Channel(partitions=(Partition(0.0, 1.0, (("z",),)),)))
     with pytest.raises(ValueError, match="names"):
         Exchange(["a", "a"])
     with pytest.raises(ValueError, match="needs an rng"):
         Exchange(FOUR, Channel(loss=0.5)).share(make_words(np.random.default_rng(0), 4, 0.0))
-
-
-def test_a_closed_exchange_says_so(make_words):
-    with Exchange(FOUR) as exchange:
-        pass
-    exchange.close()
-    with pytest.raises(BusError, match="closed"):
-        exchange.share(make_words(np.random.default_rng(0), 4, 0.0))
 
 
 def test_an_exchange_over_zenoh_stays_in_its_process(make_words):
@@ -474,17 +404,16 @@ def test_scores_and_bids_for_sixteen_jobs_fit_into_a_kilobyte() -> None:
         assert len(encode(scores)) <= 1024
 
 
-def test_an_exchange_takes_broadcasts_in_order(make_words):
+def test_an_exchange_takes_broadcasts_in_order_until_it_is_closed(make_words):
     with Exchange(ARMS) as exchange:
         exchange.begin(np.random.default_rng(0))
-        heard = exchange.share(make_words(np.random.default_rng(0), 3, 0.0))
+        exchange.share(make_words(np.random.default_rng(0), 3, 0.0))
         with pytest.raises(ValueError, match=r"-1 s after that of 0 s; begin\(\)"):
             exchange.share(make_words(np.random.default_rng(0), 3, -1.0))
-        assert exchange.arms == ARMS
         assert (exchange.delivered, exchange.late) == (6, 0)
-        assert heard.mode.dtype.kind == "i"
-        assert heard.difficulty.dtype == heard.p_saturation.dtype == heard.age_s.dtype == np.float64
     exchange.close()
+    with pytest.raises(BusError, match="closed"):
+        exchange.share(make_words(np.random.default_rng(0), 3, 0.0))
 
 
 def test_an_arm_is_on_the_bus_once():
@@ -533,12 +462,7 @@ def test_closing_leaves_no_thread_and_no_port(make_words):
         bus.open()
 
 
-def test_an_error_inside_the_block_is_the_one_that_is_seen():
-    with pytest.raises(ZeroDivisionError), ZenohExchange(ARMS, "f"):
-        _ = 1 / 0
-
-
-@pytest.mark.parametrize("ending", ["bus.close()", "pass", "del bus", "raise SystemExit(0)"])
+@pytest.mark.parametrize("ending", ["pass", "del bus", "raise SystemExit(0)"])
 def test_a_process_ends_however_it_leaves_the_exchange(ending):
     """A Zenoh session that is not closed keeps a process from ending."""
     program = f"""
@@ -563,13 +487,9 @@ print(heard.difficulty.sum(), flush=True)
     assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "4.0", "")
 
 
-@pytest.mark.parametrize("endpoint", ["tcp/10.0.0.1:7447", "tcp/0.0.0.0:7447"])
-def test_an_arm_connects_to_this_machine_alone(endpoint):
-    with pytest.raises(BusError, match="not on loopback"):
-        ZenohExchange(ARMS, "f", endpoint)
-
-
 def test_what_cannot_be_is_refused():
+    with pytest.raises(BusError, match="not on loopback"):
+        ZenohExchange(ARMS, "f", "tcp/0.0.0.0:7447")
     with pytest.raises(ValueError, match="timeout_s"):
         ZenohExchange(ARMS, "f", timeout_s=0.0)
     with pytest.raises(ValueError, match="name"):

@@ -418,6 +418,7 @@ def test_the_number_of_readers_is_limited(gateway):
         wait_until(lambda: len(gateway.readers.connected) == 64)
         assert gateway.ask("GET", "/v4/events")[0] == 503
         assert gateway.ask("GET", "/v4/fleet")[0] == 200
+    wait_until(lambda: not gateway.readers.connected)  # who disconnects is removed
 
 
 @pytest.mark.parametrize(
