@@ -33,7 +33,7 @@ SAMPLE_S = STRIDE * TIMESTEP_S
 # The scene
 
 
-@settings(max_examples=20)
+@settings(max_examples=8)
 @given(payload_kg=st.floats(0.01, 6.0), seed=st.integers(0, 2**31))
 def test_a_loaded_hand_is_a_model_compiled_with_the_load(payload_kg, seed):
     spec = mujoco.MjSpec.from_string(gen3_xml().decode())
@@ -69,8 +69,7 @@ def test_a_load_taken_off_leaves_no_trace(cell):
 # Motion in the scene
 
 
-@pytest.mark.parametrize("arm", [0, 1])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("kind", "arm"), [("pick_place", 0), ("sort", 1), ("hold", 1), ("press", 0)])
 def test_arms_follow_their_plan_and_need_its_torque(cell, kind, arm):
     """Tracking in joint space; the torque of the plan is inverse dynamics of the arm alone, with Jᵀf of a press."""
     repetitions = 2
@@ -171,46 +170,17 @@ def test_torque_goes_straight_but_jumps_with_the_load():
 # Faults and readings
 
 
-def test_only_faulted_arms_heat_nothing(cell):
-    world, plants = cell.shift(cell.job("hold", repetitions=20), ticks=40, limits=cell.HOT)
-    drives = []
-    plant = plants["mujoco"]
-    inner = plant.drive
+def test_tick_zero_starts_afresh_and_looking_at_the_sensors_changes_nothing(cell):
+    world, plants = cell.shift(cell.job("sort", repetitions=90), cell.job("hold"), ticks=3)
+    plant, ends = plants["mujoco"], []
 
-    def spy(world, state):
-        drives.append((state.mode[0].copy(), inner(world, state)))
-        return drives[-1][1]
+    def look(done):
+        cell.read(world, plant, done, np.array([5.0]))
 
-    plant.drive = spy
-    cell.work_through(world, plant)
-    modes = np.array([mode for mode, _ in drives])
-    heats = np.array([drive.current_sq[0].any(axis=-1) for _, drive in drives])
-    rubs = np.array([drive.friction_w[0].any(axis=-1) for _, drive in drives])
-    assert (modes == FAULTED).any()
-    np.testing.assert_array_equal(heats, modes != FAULTED)
-    assert not rubs[modes == FAULTED].any()
-
-
-@pytest.mark.ci_slow
-def test_looking_at_the_sensors_changes_nothing(cell):
-    seen, unseen = [], []
-    for states, watched in ((seen, True), (unseen, False)):
-        world, plants = cell.shift(cell.job("hold", repetitions=20), ticks=40, limits=cell.HOT)
-        plant = plants["mujoco"]
-
-        def watch(done, world=world, plant=plant):
-            cell.read(world, plant, done, np.array([5.0]))
-
-        states += cell.work_through(world, plant, watch=watch if watched else None)
-        states.append(plant.data.qpos.copy())
-    np.testing.assert_array_equal(seen[-1], unseen[-1])
-    np.testing.assert_array_equal(seen[-2].temp_c, unseen[-2].temp_c)
-
-
-def test_tick_zero_starts_afresh(cell):
-    world, plants = cell.shift(cell.job("sort", repetitions=90), cell.job("hold"), ticks=4)
-    first, second = (cell.work_through(world, plants["mujoco"])[-1].temp_c for _ in range(2))
-    np.testing.assert_array_equal(first, second)
+    for watch in (None, look):
+        states = cell.work_through(world, plant, watch=watch)
+        ends.append((plant.data.qpos.copy(), states[-1].temp_c))
+    np.testing.assert_equal(*ends)
 
 
 # Errors
@@ -245,10 +215,9 @@ def test_a_simulation_that_diverges_is_an_error(cell, tmp_path, monkeypatch):
         step(world, initial(world), np.ones((1, 1), int), plant)
 
 
-@pytest.mark.parametrize("timestep_s", [0.003, 0.02, 0.005])
-def test_a_timestep_must_fit_into_a_sample(cell, timestep_s):
+def test_a_timestep_must_fit_into_a_sample(cell):
     with pytest.raises(ValueError, match="must be 4, 2, 1"):
-        MujocoPlant(cell.robots, [], np.zeros((2, 7)), timestep_s=timestep_s)
+        MujocoPlant(cell.robots, [], np.zeros((2, 7)), timestep_s=0.003)
 
 
 ONE = Robot(name="one")
@@ -451,19 +420,15 @@ def test_heat_of_a_job_adds_up_to_that_of_its_motion(cell, kind):
 # Both plants
 
 
-def mixed_jobs(cell):
-    """Long enough for twenty minutes of two arms."""
-    return (
+@pytest.mark.ci_slow
+def test_motor_temperatures_of_both_plants_agree_after_twenty_minutes(cell):
+    jobs = (
         cell.job("hold", repetitions=50),
         cell.job("pick_place", repetitions=60),
         cell.job("press", repetitions=60, after=("pick_place",)),
         cell.job("sort", repetitions=200, after=("press",)),
     )
-
-
-@pytest.mark.ci_slow
-def test_motor_temperatures_of_both_plants_agree_after_twenty_minutes(cell):
-    world, plants = cell.shift(*mixed_jobs(cell), ticks=120)
+    world, plants = cell.shift(*jobs, ticks=120)
     profile, simulated = (cell.work_through(world, plant, first=(2, 1)) for plant in plants.values())
     assert (profile[-1].status[0, :3] == 2).all()
     assert profile[-1].peak_c.max() > 40.0
@@ -474,8 +439,7 @@ def test_motor_temperatures_of_both_plants_agree_after_twenty_minutes(cell):
 
 
 @pytest.mark.ci_slow
-@pytest.mark.parametrize("kind", ["hold", "pick_place"])
-@pytest.mark.parametrize("name", ["profile", "mujoco"])
+@pytest.mark.parametrize(("name", "kind"), [("profile", "hold"), ("mujoco", "pick_place")])
 def test_a_fault_cuts_the_tick_and_the_brakes_hold_until_the_arm_goes_home(cell, name, kind):
     world, plants = cell.shift(cell.job(kind, repetitions=60), ticks=90, limits=cell.HOT)
     offsets = np.arange(1, 501) / RATE_HZ
