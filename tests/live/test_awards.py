@@ -10,22 +10,10 @@ from fleet.live.arm.awards import (
     CLOCK_DRIFT,
     MAX_PAST_AWARDS,
     ArmHistory,
-    ArmRecord,
-    AwardExecutor,
     ExecutorConfig,
-    Started,
 )
-from fleet.live.journal import Journal
 from tests.live.award_shop import JOB, LEASE_S, OTHER, VALID_S, award_on, finished, quoted, shop, taken
 from tests.live.disk import Disk
-
-
-def test_an_award_on_a_valid_quote_is_accepted_and_on_disk():
-    executor, disk = shop()
-    award = taken(executor)
-    assert [held.award for held in executor.active] == [award]
-    assert list(ArmHistory().replay(disk.records).active) == [award.award]
-    assert executor.spare_capacity == 0
 
 
 @pytest.mark.parametrize(
@@ -352,20 +340,3 @@ def test_a_compacted_history_is_the_same_history(cycles, leave, closed):
     assert {n: (h.award, h.cycles, h.may_commit) for n, h in told.active.items()} == {
         n: (h.award, h.cycles, h.may_commit) for n, h in history.active.items()
     }
-
-
-def test_a_journal_on_disk_restores_the_history(tmp_path):
-    with Journal(tmp_path / "a.jsonl", ArmRecord) as journal:
-        history = ArmHistory().replay(journal.records()).after_restart("a", 0.0)
-        journal.rewrite(*history.compact())
-        award = taken(AwardExecutor("a", journal.append, history, nonce="n"))
-    with Journal(tmp_path / "a.jsonl", ArmRecord) as journal:
-        again = ArmHistory().replay(journal.records())
-    assert list(again.active) == [award.award]
-    assert again.boot == 1
-
-
-def test_a_first_start_is_the_first_boot():
-    assert ArmHistory().after_restart("a", 0.0).boot == 1
-    history = ArmHistory().replay([Started(boot=4)]).after_restart("a", 0.0)
-    assert history.compact() == (Started("a", boot=5),)

@@ -185,23 +185,6 @@ def test_release_in_the_last_cycle_finishes_no_job(small):
     assert [e.kind for e in body.advance(60.0)] == ["home"]
 
 
-def test_a_fault_returns_the_job_with_its_cycles_and_the_arm_recovers(small):
-    arm, job, plan = one_job(small, repetitions=5000, payload=small.HOT)
-    body = body_of(arm, limits=SOON_HOT)
-    body.start(job, plan, 7)
-    body.allow_cycles(5000)
-    events = body.advance(1200.0)
-    kinds = [e.kind for e in events]
-    assert kinds[:4] == ["torque_warning", "warning", "fault", "return"]
-    fault, returned = events[2], events[3]
-    assert returned.time_s == fault.time_s
-    assert returned.value == 7 + (fault.time_s - 3.0) // 10.0
-    assert kinds[4:] == ["recover", "home"]  # it stood away from home until then
-    assert body.is_free
-    assert body.job == ""
-    assert 40.0 <= body.truth.peak_c[0, 0] < 41.0
-
-
 def test_a_faulted_arm_is_not_free_until_a_person_clears_the_fault_of_the_cool_arm(small):
     arm, job, plan = one_job(small, repetitions=5000, payload=small.HOT)
     body = body_of(arm, limits=SOON_HOT)
