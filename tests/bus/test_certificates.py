@@ -73,33 +73,18 @@ def allowed(rules: dict, who: str, flow: str, message: str, key: str) -> bool:
 
 
 @pytest.mark.parametrize("message", ["put", "liveliness_token", "declare_queryable", "reply"])
-def test_every_key_has_the_speakers_that_it_should_have(message):
-    """Of all keys there are: those of an arm belong to that arm, those of a policy to that policy, all others to the
-    auctioneer they name, or to any."""
-    roster = of_arms("f", ROSTER_ARMS, [RosterEntry("mine", "policy")])
+@pytest.mark.parametrize("auctioneer", [True, False])
+def test_every_key_has_the_speakers_that_it_should_have(message, auctioneer):
+    """Of all keys there are: those with a name belong to it, the others to the auctioneer; without one, to all arms."""
+    roster = of_arms("f", ROSTER_ARMS, [RosterEntry("mine", "policy")], auctioneer=auctioneer)
+    assert roster.by_consensus != auctioneer
     rules = access_control(roster)
     for key, participant in product(EVERY_KEY, roster.participants):
         place = keys.parse(key)
-        owner = "auctioneer" if place.role in NAMELESS else place.name
-        may = allowed(rules, participant.common_name, "ingress", message, key)
-        assert may == (participant.name == owner), (participant, key)
-        cache = f"{key}/@adv/pub/1/2"
-        assert allowed(rules, participant.common_name, "ingress", message, cache) == may, (participant, cache)
-
-
-def test_arms_without_an_auctioneer_answer_outsiders_and_nobody_else_does():
-    roster = of_arms("f", ROSTER_ARMS, auctioneer=False)
-    assert roster.by_consensus
-    assert not of_arms("f", ROSTER_ARMS).by_consensus
-    rules = access_control(roster)
-    for key, participant in product(EVERY_KEY, roster.participants):
-        place = keys.parse(key)
-        owner = participant.role == "arm" and (
-            place.role in NAMELESS or (place.role, place.name) == ("arm", participant.name)
-        )
-        owner |= (participant.role, place.role, place.name) == ("operator", "monitor", "operator")
-        for message in ("reply", "declare_queryable", "put"):
-            assert allowed(rules, participant.common_name, "ingress", message, key) == owner, (participant, key)
+        speaks = participant.role == ("auctioneer" if auctioneer else "arm")
+        may = speaks if place.role in NAMELESS else participant.name == place.name
+        for each in (key, f"{key}/@adv/pub/1/2"):
+            assert allowed(rules, participant.common_name, "ingress", message, each) == may, (participant, each)
 
 
 def test_what_ends_in_the_name_of_an_arm_is_asked_by_that_arm_alone():

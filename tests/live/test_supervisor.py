@@ -82,18 +82,17 @@ def test_a_killed_process_is_restarted_while_its_child_holds_the_output_open(tmp
             os.killpg(supervisor.pid("a"), signal.SIGKILL)
 
 
-def test_a_process_that_always_fails_is_restarted_with_delays(tmp_path):
+@pytest.mark.parametrize(
+    ("code", "backoff", "least_s"),
+    [(3, Backoff(first_s=0.1, factor=2.0), 0.1 + 0.2 + 0.4), (WAITS, Backoff(0.1, factor=1000.0, max_s=100.0), 0.3)],
+    ids=["that always fails", "without a router"],
+)
+def test_a_process_is_restarted_with_growing_delays_unless_it_waits_for_a_router(tmp_path, code, backoff, least_s):
     start_s = time.monotonic()
-    with Supervisor(tmp_path, backoff=Backoff(first_s=0.2, factor=2.0)) as supervisor:
-        supervisor.start(part("a", "raise SystemExit(3)"))
+    with Supervisor(tmp_path, backoff=backoff) as supervisor:
+        supervisor.start(part("a", f"raise SystemExit({code})"))
         supervisor.run(until(lambda: supervisor.restarts()["a"] == 3), poll_s=0.02)
-    assert time.monotonic() - start_s >= 0.2 + 0.4 + 0.8
-
-
-def test_a_process_without_a_router_is_started_again_after_the_first_delay_each_time(tmp_path):
-    with Supervisor(tmp_path, backoff=Backoff(first_s=0.1, factor=1000.0, max_s=100.0)) as supervisor:
-        supervisor.start(part("a", f"raise SystemExit({WAITS})"))
-        supervisor.run(until(lambda: supervisor.restarts()["a"] == 3), poll_s=0.02)
+    assert time.monotonic() - start_s >= least_s
 
 
 def test_a_full_log_disk_ends_neither_the_process_nor_its_supervision(tmp_path):

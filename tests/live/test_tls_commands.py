@@ -186,10 +186,12 @@ def test_an_error_of_tls_is_one_sentence(fleet):
 
 
 def test_the_doctor_mentions_a_certificate_unknown_to_the_router(fleet, tmp_path):
+    place = tmp_path / "k"
+    make(place, of_arms("f", [ARM]), days=30)
     for name in ("ca.pem", "ca.key"):
-        (tmp_path / name).write_bytes((fleet.keys / name).read_bytes())
-    issue(tmp_path, RosterEntry("spy", "monitor"), days=20)
-    done = run("doctor", f"{fleet.address}#{tmp_path}/spy")
+        (place / name).write_bytes((fleet.keys / name).read_bytes())
+    issue(place, RosterEntry("spy", "monitor"), days=20)
+    done = run("doctor", f"{fleet.address}#{place}/spy")
     assert done.exit_code == 1
     assert "the router does not know this certificate" in " ".join(done.stdout.split())
 
