@@ -84,7 +84,7 @@ def test_a_killed_process_is_restarted_while_its_child_holds_the_output_open(tmp
 
 @pytest.mark.parametrize(
     ("code", "backoff", "least_s"),
-    [(3, Backoff(first_s=0.1, factor=2.0), 0.1 + 0.2 + 0.4), (WAITS, Backoff(0.1, factor=1000.0, max_s=100.0), 0.3)],
+    [(3, Backoff(first_s=0.1, factor=2.0), 0.1 + 0.2 + 0.4), (WAITS, Backoff(first_s=0.1, factor=1e3, max_s=1e2), 0.3)],
     ids=["that always fails", "without a router"],
 )
 def test_a_process_is_restarted_with_growing_delays_unless_it_waits_for_a_router(tmp_path, code, backoff, least_s):
