@@ -19,13 +19,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.router import Router
 from fleet.live.monitor.snapshot import ArmSnapshot, FleetSnapshot, JobScore
 from scenarios.live.fleet_processes import free_port
-from scenarios.show.watch import (
-    GONE_S,
-    ShiftEnd,
-    format_age,
-    format_scores,
-    screen,
-)
+from scenarios.show.watch import GONE_S, ShiftEnd, format_age, format_scores, screen
 from tests import commands
 from tests.waiting import PATIENCE_S
 
