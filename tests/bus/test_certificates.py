@@ -275,9 +275,10 @@ def breaking(name, nth):
             raise OSError(28, "No space left on device")
         return real(*args)
 
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(BusError, match="No space left"):
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, name, fail)
-        yield
+        with pytest.raises(BusError, match="No space left"):
+            yield
 
 
 @pytest.mark.parametrize(

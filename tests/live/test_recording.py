@@ -41,7 +41,7 @@ from tests.waiting import PATIENCE_S, serve_until, wait_until
 @pytest.fixture(autouse=True)
 def quick_disk(monkeypatch):
     """No test here cuts the power."""
-    monkeypatch.setattr(os, "fsync", lambda _: None)
+    monkeypatch.setattr("os.fsync", lambda _: None)
 
 
 def state(arm, tick, time_s=None):

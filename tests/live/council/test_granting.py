@@ -6,7 +6,15 @@ from contextlib import nullcontext
 import pytest
 
 from fleet.bus.protocol.auction import Award, JobSpec
-from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, History, JobOutcome
+from fleet.bus.protocol.consensus import (
+    Claim,
+    ClaimEntry,
+    ClaimReply,
+    DeniedEntry,
+    GrantedEntry,
+    History,
+    JobOutcome,
+)
 from fleet.errors import BusError, Refused
 from fleet.live.arm.awards import ArmHistory, AwardExecutor
 from fleet.live.book import JobBook
@@ -317,6 +325,112 @@ def test_a_request_is_withdrawn_if_the_granters_together_know_too_many_faults():
     assert one.claimant.rejected == ["j"]
     assert not one.send_claim(0.2).entries
     assert one.granter.book.jobs["j"].state == "given_up"
+
+
+THREE = ("a", "b", "c")
+LATER_S = 1e6
+
+
+def same_name(arm: str, space: str, other: str, other_space: str) -> bool:
+    """Two plans exclude each other if their names begin with the same letter; an arm that may be anywhere, all."""
+    return "*" in (space, other_space) or space[0] == other_space[0]
+
+
+class Granting:
+    """Arm `c`, its disk, and claims of its peers."""
+
+    def __init__(self):
+        self.records, self.number = [], 0
+        self.start(0.0)
+        for arm in THREE:
+            self.claim(arm)
+
+    def start(self, real_s: float) -> None:
+        book = JobBook(is_central=False).replay(self.records)
+        self.records[:] = book.compact()
+        self.granter = Granter(
+            "c",
+            THREE,
+            book,
+            lambda *records: self.records.extend(records),
+            real_s=real_s,
+            timing=TIMING,
+            excludes=same_name,
+        )
+
+    def claim(self, arm: str, *jobs: str, space=(), at_s: float = 0.0, phase="requested", outcomes=()) -> list[str]:
+        """Claim jobs, each with a plan of its name; return the reasons for which they are denied."""
+        self.number += 1
+        entries = tuple(ClaimEntry(f"{arm}: {job}", job, (f"at {job}",), 0, phase, job) for job in jobs)
+        claim = Claim(arm, self.number, entries, tuple(outcomes), space=space)
+        return [denied.reason for denied in self.granter.answer_claim(claim, at_s).denied]
+
+
+@pytest.fixture
+def granting():
+    return Granting()
+
+
+def test_of_two_plans_that_exclude_each_other_one_is_granted(granting):
+    assert granting.claim("a", "p1", "q1") == []
+    assert granting.claim("b", "p2", "r1") == ["'a' is in the way"]
+    assert granting.claim("a", "q1") == []
+    assert granting.claim("b", "p2", "r1") == []
+
+
+@pytest.mark.parametrize("restart", [False, True])
+def test_space_stays_taken_after_the_lease_and_after_a_restart(granting, restart):
+    assert granting.claim("a", "p1", phase="working") == []
+    if restart:
+        granting.start(LATER_S)
+    assert granting.claim("b", "p2", at_s=LATER_S) == ["'a' is in the way"]
+    assert granting.claim("a", space=("p1",), at_s=LATER_S) == []  # it is on its way home
+    assert granting.claim("b", "p2", at_s=LATER_S) == ["'a' is in the way"]
+    granting.claim("a", at_s=LATER_S)
+    assert granting.claim("b", "p2", at_s=LATER_S) == []
+
+
+def test_space_of_a_finished_job_stays_taken_until_the_arm_is_home(granting):
+    granting.claim("a", "p1", phase="finishing")
+    outcome = JobOutcome("p1", "a: p1", "a", "finished", 1, 9.0)
+    granting.claim("a", space=("p1",), outcomes=[outcome])
+    assert granting.claim("b", "p2") == ["'a' is in the way"]
+    granting.claim("a")
+    assert granting.claim("b", "p2") == []
+
+
+def test_an_arm_without_a_claim_or_that_does_not_say_where_it_is_may_be_anywhere():
+    granting = Granting()
+    granting.records.clear()
+    granting.start(0.0)
+    assert granting.claim("b", "p2") == ["'a' is in the way"]
+    granting.claim("c")
+    granting.claim("a", space=None)
+    assert granting.claim("b", "p2") == ["'a' is in the way"]
+    granting.claim("a")
+    assert granting.claim("b", "p2") == []
+
+
+def test_a_person_frees_the_space_of_an_arm_that_is_not_heard(granting):
+    granting.claim("a", "p1", phase="finishing")
+    for present, at_s, reason in ((set(), 0.0, "lease of 'a' has not ended"), ({"a"}, LATER_S, "present")):
+        with pytest.raises(Refused, match=reason):
+            granting.granter.clear("a", "me", frozenset(present), at_s, 0.0)
+    with pytest.raises(Refused, match=r"no arm of this fleet. Arms: a, b, c."):
+        granting.granter.clear("z", "me", frozenset(), LATER_S, 0.0)
+    granting.granter.clear("a", "me", frozenset(), LATER_S, 0.0)
+    count = len(granting.records)
+    granting.granter.clear("a", "me", frozenset(), LATER_S, 0.0)
+    assert len(granting.records) == count  # the same request again changes nothing
+    granting.start(LATER_S)
+    assert granting.claim("b", "p2", at_s=LATER_S + TIMING.lease_s + 1) == []
+    granting.claim("b", at_s=LATER_S + TIMING.lease_s + 1)
+    for restart in (False, True):  # it is heard again, away from home
+        if restart:
+            granting.start(LATER_S)
+        again = granting.claim("a", "p1", space=("p1",), at_s=2 * LATER_S, phase="finishing")
+        assert again == ["the space of 'a' was cleared"]
+    assert granting.claim("c", "p3", at_s=2 * LATER_S) == ["'a' is in the way"]
 
 
 @pytest.mark.parametrize(
