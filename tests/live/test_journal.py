@@ -29,8 +29,7 @@ from fleet.live.consensus.participant import Membership
 from fleet.live.journal import CommitPermitted, CompactingJournal, Journal, Started, TimeRecorder
 from fleet.live.records import BookRecord
 from scenarios.live.arm import restart_history
-from tests.live.council.test_council_poison import Arm
-from tests.live.test_poison import Wire
+from tests.live.test_poison import Arm, Wire
 from tests.profiles import examples
 
 ROOT = Path(__file__).parents[2]
