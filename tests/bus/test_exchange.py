@@ -82,17 +82,10 @@ def test_a_partition_cuts_what_lies_between_groups_and_those_of_no_group_keep_to
 
 
 def test_only_the_default_is_perfect():
-    assert PERFECT.perfect
     assert Channel() == PERFECT
-    partition = Partition(0.0, 1.0, (("a",),))
-    for changes in (
-        {"topology": "ring"},
-        {"delay_s": 1.0},
-        {"jitter_s": 1.0},
-        {"loss": 0.1},
-        {"partitions": [partition]},
-    ):
-        assert not Channel(**changes).perfect
+    partitions = (Partition(0.0, 1.0, (("a",),)),)
+    others = ({"topology": "ring"}, {"delay_s": 1.0}, {"jitter_s": 1.0}, {"loss": 0.1}, {"partitions": partitions})
+    assert [Channel(**changes).perfect for changes in ({}, *others)] == [True] + 5 * [False]
 
 
 @pytest.mark.parametrize(
@@ -413,24 +406,6 @@ def barrier(session: zenoh.Session) -> None:
     assert list(session.liveliness().get("thermofleet/v4/*/arm/*/alive", timeout=PATIENCE_S))
 
 
-def test_a_late_joiner_gets_the_last_word_and_who_said_it(make_words):
-    """With nothing but Zenoh: the caches answer a subscriber that was not there."""
-    samples: queue.Queue[zenoh.Sample] = queue.Queue()
-    with ZenohExchange(ARMS, "f", timeout_s=PATIENCE_S) as bus:
-        bus.share(make_words(np.random.default_rng(5), 3, 0.0))
-        with open_client(bus.endpoint or "", timeout_s=PATIENCE_S) as joiner:
-            history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
-            for topic in ("info", "difficulty"):
-                zenoh.ext.declare_advanced_subscriber(
-                    joiner, keys.of_every_arm("f", topic), samples.put, history=history
-                )
-            tokens = joiner.liveliness().get(keys.of_every_arm("f", "alive"), timeout=PATIENCE_S)
-            present = {keys.parse(str(reply.ok.key_expr)).name for reply in tokens if reply.ok}
-            heard = {str(samples.get(timeout=PATIENCE_S).key_expr) for _ in range(6)}
-    assert present == set(ARMS)
-    assert heard == {keys.of_arm("f", arm, topic) for arm in ARMS for topic in ("info", "difficulty")}
-
-
 def test_closing_leaves_no_thread_and_no_port(make_words):
     threads = set(threading.enumerate())
     bus = ZenohExchange(ARMS, "f", timeout_s=PATIENCE_S).open()
@@ -481,15 +456,6 @@ def test_what_cannot_be_is_refused():
         ZenohExchange(ARMS, "")
     with pytest.raises(ValueError, match="names"):
         ZenohExchange(["a", "a"], "f")
-
-
-def test_no_router_is_an_error_and_leaves_nothing_open():
-    with Router() as router:
-        endpoint = router.endpoint
-    threads = set(threading.enumerate())
-    with pytest.raises(BusError, match="No router answered"):
-        ZenohExchange(ARMS, "f", endpoint, timeout_s=0.2).open()
-    assert set(threading.enumerate()) <= threads
 
 
 BUS_FOUR = ("arm_0", "arm_1", "arm_2", "arm_3")

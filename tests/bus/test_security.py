@@ -17,8 +17,8 @@ from fleet.bus.protocol.auction import Ack, Award, JobSpec, Lease, LeaseEntry, L
 from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, GrantedEntry
 from fleet.bus.protocol.messages import Info, encode, encoding
 from fleet.bus.router import Router, open_client
-from fleet.bus.security.access_control import RosterEntry, of_arms
-from fleet.bus.security.certificates import add, issue, make
+from fleet.bus.security.access_control import RosterEntry
+from fleet.bus.security.certificates import issue
 from fleet.bus.security.tls import Tls
 from tests.waiting import PATIENCE_S, serve_until
 
@@ -303,21 +303,3 @@ def test_somebody_whom_the_authority_knows_and_the_roster_does_not_may_do_nothin
         assert deaf == []
         subscriber.undeclare()
     ear.undeclare()
-
-
-def test_one_that_is_added_may_speak_when_the_router_starts_again(tmp_path, inside):
-    place = tmp_path / "k"
-    make(place, of_arms("f", ["arm_0"]), days=30)
-    new, key = RosterEntry("arm_7", "arm"), keys.of_arm("f", "arm_7", "state")
-    add(place, new, days=30)
-    heard: queue.Queue[str] = queue.Queue()
-    for _ in range(2):  # the second time with a new certificate of the same authority
-        with (
-            Router(tls=Tls(place, "router")) as router,
-            open_client(router.endpoint, timeout_s=PATIENCE_S, tls=Tls(place, "arm_7")) as arm,
-        ):
-            ear = inside(router).declare_subscriber("**", lambda sample: heard.put(str(sample.key_expr)))
-            arm.put(key, b"mine")
-            assert heard.get(timeout=PATIENCE_S) == key
-            ear.undeclare()
-        add(place, new, days=60, overwrite=True)

@@ -247,17 +247,6 @@ def test_after_a_failed_sync_further_writes_are_refused_until_it_is_reopened(dis
     assert read(disk.path("j")) in ([Text("kept")], [Text("kept"), Text("perhaps")])
 
 
-def test_a_rewritten_journal_contains_only_the_new_records(tmp_path):
-    path = tmp_path / "j"
-    written(path, *[[Counted(n)] for n in range(50)])
-    with Journal(path, KIND) as journal:
-        journal.rewrite(Counted(49))
-        journal.append(Text("next"))
-        assert list(journal.records()) == [Counted(49), Text("next")]
-    assert read(path) == [Counted(49), Text("next")]
-    assert [each.name for each in tmp_path.iterdir()] == ["j"]
-
-
 @pytest.mark.parametrize("power", [False, True], ids=["killed", "without power"])
 def test_a_crash_at_any_moment_leaves_what_was_written_before_or_after(disk, power):
     """At every call of the disk, ten times with other writes lost: an append that has returned is on disk."""

@@ -14,7 +14,6 @@ from fleet.arm.gen3 import gen3_xml
 from fleet.arm.model import ArmModel, build_cell, links_of, set_payload_balls
 from fleet.arm.planner import Planner
 from fleet.arm.plant import STRIDE, TIMESTEP_S, MujocoPlant, control, load_hands, reference, still
-from fleet.arrivals import Arrivals
 from fleet.engine.profile_plant import sample, sample_row
 from fleet.engine.shift import initial, step
 from fleet.engine.tables import drive_of
@@ -25,8 +24,6 @@ from fleet.motion import RATE_HZ, Phase, Plan
 from fleet.offered_plans import PLANS
 from fleet.robot import GEN3, POSTURES, Mount, Robot
 from fleet.telemetry import FAULTED, IDLE, WORKING
-from scenarios.prepare.fleet import make_env
-from scenarios.spec.schema import ArmSpec, JobStream, Planning, Scenario
 
 SAMPLE_S = STRIDE * TIMESTEP_S
 
@@ -466,30 +463,3 @@ def test_a_fault_cuts_the_tick_and_the_brakes_hold_until_the_arm_goes_home(cell,
     path = np.concatenate([part.q[:, 0] for part in parts])
     assert np.abs(np.diff(path, axis=0)).max() < 1.4 / RATE_HZ
     np.testing.assert_allclose(path[0], cell.robots[0].home_q(), atol=0.05)
-
-
-def test_a_scenario_chooses_its_plant(cell, tmp_path):
-    scenario = Scenario(
-        name="two",
-        description="",
-        horizon_s=60.0,
-        arms=(ArmSpec(name="one"),),
-        places=cell.places,
-        jobs=(
-            JobStream(
-                name="sort", kind="sort", places=("near", "far"), arrivals=Arrivals(kind="trace", times_s=(0.0,))
-            ),
-        ),
-        planning=Planning(elbows=1, speeds=(1.0,)),
-    )
-    peaks = {}
-    for name in ("profile", "mujoco"):
-        env = make_env(scenario, difficulty="blind", plant=name, cache=tmp_path)
-        env.reset(seed=0)
-        while env.agents:
-            env.step(dict.fromkeys(env.agents, 1))
-        assert isinstance(env.episode.plant, MujocoPlant) == (name == "mujoco")
-        assert (env.truth.status == 2).all()
-        peaks[name] = env.truth.temp_c
-        env.close()
-    np.testing.assert_allclose(peaks["profile"], peaks["mujoco"], atol=0.1)
