@@ -117,6 +117,6 @@ def recorded(world, plant, offsets_s, **options):
 def cell() -> SimpleNamespace:
     """The cell, and how its shifts are worked and recorded."""
     return SimpleNamespace(
-        robots=ROBOTS, works=WORKS, plans=planned(), places=(NEAR, FAR), HOT=HOT,
+        robots=ROBOTS, works=WORKS, plans=planned(), HOT=HOT,
         shift=shift, job=job, work_through=work_through, recorded=recorded, read=read,
     )  # fmt: skip
