@@ -19,14 +19,12 @@ import zenoh
 from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 
-from agents.registry import make_policy
 from fleet.bus.exchange.channel import PERFECT, Channel, Partition
 from fleet.bus.exchange.memory import UNHEARD, Broadcast, Delivery, Exchange
 from fleet.bus.exchange.zenoh import ZenohExchange, messages_of
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import DifficultyScores, State, decode, encode
 from fleet.bus.router import Router, open_client
-from fleet.env.allocation_v2 import parallel_env
 from fleet.errors import BusError
 from tests.profiles import examples
 from tests.waiting import PATIENCE_S
@@ -456,32 +454,3 @@ def test_what_cannot_be_is_refused():
         ZenohExchange(ARMS, "")
     with pytest.raises(ValueError, match="names"):
         ZenohExchange(["a", "a"], "f")
-
-
-BUS_FOUR = ("arm_0", "arm_1", "arm_2", "arm_3")
-CHANNELS = {
-    "perfect": Channel(),
-    "ring": Channel(
-        topology="ring",
-        delay_s=10.0,
-        jitter_s=15.0,
-        loss=0.2,
-        partitions=(Partition(60.0, 120.0, (("arm_0", "arm_1"), ("arm_2", "arm_3"))),),
-    ),
-}
-
-
-@pytest.mark.parametrize("channel", CHANNELS.values(), ids=CHANNELS)
-def test_the_same_seed_gives_the_same_awards_over_either(small, channel):
-    def shift(exchange: Exchange) -> tuple[list[str], int]:
-        env = parallel_env(small.Shifts(arms=4, jobs=20, ticks=60), exchange=exchange, keep_events=True)
-        policy = make_policy("least_difficulty")
-        env.reset(seed=3)
-        while env.agents:
-            env.step(policy.act(env.knowledge()))
-        return [repr(event) for event in env.events], env.messages
-
-    with ZenohExchange(BUS_FOUR, "trace", channel=channel, timeout_s=PATIENCE_S) as bus:
-        over_zenoh = shift(bus)
-    assert over_zenoh == shift(Exchange(BUS_FOUR, channel))
-    assert sum("award" in event for event in over_zenoh[0]) > 5

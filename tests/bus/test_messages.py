@@ -31,7 +31,6 @@ from fleet.bus.protocol.messages import (
     encode,
     encoding,
 )
-from fleet.bus.protocol.operator import ControlRequest
 from fleet.errors import is_name
 from fleet.events import EVENT_KINDS, MEANINGS
 from fleet.live.arm.body import _REPORTED
@@ -271,14 +270,6 @@ def test_a_malformed_state_is_refused_with_words(payload):
 def test_an_integer_is_a_number_and_an_encoding_has_a_version():
     assert received(State, encode(STATE).replace(b"18.5", b"18"), "arm_0").headroom_k == 18.0
     assert encoding(State) == "application/json;thermofleet.State.v4"
-
-
-@pytest.mark.parametrize("action", ["pause", "resume"])
-@pytest.mark.parametrize("arm", ["", "x" * 513])
-def test_the_arm_of_a_pause_has_the_bounds_of_a_name(action, arm):
-    request = {"request": "1", "action": {"action": action, "arm": arm}}
-    with pytest.raises(MalformedMessage, match="length"):
-        decode(ControlRequest, json.dumps(request).encode())
 
 
 ROOT = Path(__file__).parents[2]

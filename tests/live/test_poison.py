@@ -243,13 +243,6 @@ def test_no_message_stops_an_arm_or_an_auctioneer(participants, data):
     assert resident() - arm.first_bytes < GROWN_BYTES
 
 
-@pytest.mark.parametrize("dwell_s", [60_000, 200_000, 1e12, 1e308])
-def test_a_dwell_time_in_milliseconds_is_refused_by_its_field(dwell_s):
-    body = json.dumps({"auction": "r", "dry_run": True, "jobs": [json.loads(encode(JOB)) | {"dwell_s": dwell_s}]})
-    with pytest.raises(MalformedMessage, match=r"dwell_s must be between 0.02 and 3600 s \(got"):
-        decode(QuoteRequest, body.encode())
-
-
 def test_a_long_hold_costs_no_more_than_a_short_one_and_has_its_peak(participants):
     """Second method: repetitions of a short hold that are as long together."""
     arm, _ = participants

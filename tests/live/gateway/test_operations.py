@@ -23,7 +23,6 @@ from fleet.live.monitor.snapshot import ArmSnapshot, AuctioneerSnapshot, FleetLi
 from scenarios.live import webhooks
 from scenarios.live.metrics import METRICS, exposition
 from scenarios.live.webhooks import MOST_WAITING, Webhook
-from tests.live.gateway.served import Served
 from tests.waiting import PATIENCE_S, wait_until
 
 ODD = 'a"b\\c\nd'
@@ -145,22 +144,6 @@ def test_an_alarm_is_shown_acknowledged_and_published(gateway, arm, router):
     labels = (("acknowledged", "yes"), ("fleet", "f"), ("kind", "given_up"))
     assert values["thermofleet_alarms", labels] == 1
     line.close()
-
-
-def test_two_gateways_of_a_fleet_show_one_alarm_with_one_acknowledgement(gateway, arm, router):
-    with Served(router) as second:
-        arm.post(lambda: arm.set("twice lost job", state="given_up", reason="three faults"))
-
-        def alarm_of(shown):
-            found = [each for each in shown.ask("GET", "/v4/alarms")[2] if each["subject"] == "twice lost job"]
-            assert len(found) <= 1
-            return found and found[0]
-
-        first, other = (wait_until(lambda each=each: alarm_of(each)) for each in (gateway, second))
-        assert first["alarm"] == other["alarm"]
-        assert second.ask("POST", "/v4/alarms", {"alarm": first["alarm"], "by": "ann"})[0] == 200
-        wait_until(lambda: alarm_of(gateway)["by"] == "ann")
-        assert gateway.ask("POST", "/v4/alarms", {"alarm": first["alarm"], "by": "bob"})[0] == 409
 
 
 def test_an_alarm_of_a_monitor_that_has_exited_ends(gateway, router, monkeypatch):
