@@ -279,6 +279,14 @@ def test_a_delayed_word_is_the_word_of_then_under_the_names_of_now(make_words, t
                         np.testing.assert_array_equal(actual, np.broadcast_to(expected, np.shape(actual)))
 
 
+def test_a_delay_is_not_a_tick_longer_for_a_rounding(make_words):
+    """0.1 + 0.2 > 0.3 in binary."""
+    exchange = Exchange(FOUR, Channel(delay_s=0.2))
+    rng = np.random.default_rng(0)
+    exchange.share(make_words(rng, 4, 0.1))
+    assert np.isfinite(exchange.share(make_words(rng, 4, 0.3)).age_s).all()
+
+
 def test_an_exchange_that_cannot_be_is_refused(make_words):
     with pytest.raises(ValueError, match=r"A partition names an unknown arm 'z'.*Allowed: a, b, c, d"):
         Exchange(FOUR, Channel(partitions=(Partition(0.0, 1.0, (("z",),)),)))
