@@ -63,10 +63,7 @@ def test_loopback_is_allowed(endpoint):
     ("endpoint", "reason"),
     [
         ("tcp/0.0.0.0:7447", "not on loopback"),
-        ("tcp/[::]:7447", "not on loopback"),
-        ("tcp/192.168.1.10:7447", "not on loopback"),
         ("tcp/[::ffff:192.168.1.10]:7447", "not on loopback"),
-        ("tcp/example.org:7447", "may resolve to another machine"),
         ("tcp/localhost.example.org:7447", "may resolve to another machine"),
         ("tcp/127.1:7447", "may resolve to another machine"),
         ("udp/127.0.0.1:7447", "Expected tcp"),
@@ -74,7 +71,6 @@ def test_loopback_is_allowed(endpoint):
         ("tcp/127.0.0.1:99999", "Expected tcp"),
         ("tcp/127.0.0.1:7447#iface=eth0", "Expected tcp"),
         ("tcp/127.0.0.1:7447,tcp/10.0.0.1:7447", "Expected tcp"),
-        ("127.0.0.1:7447", "Expected tcp"),
         ("", "Expected tcp"),
     ],
 )
@@ -98,7 +94,6 @@ def test_with_a_certificate_an_endpoint_may_be_anywhere(endpoint):
         ("tcp/10.0.0.1:7447", None, "Plain TCP does not authenticate"),
         ("tcp/127.0.0.1:7447", TLS, "no endpoint for the certificate of 'arm_0'"),
         ("tls/127.0.0.1:0", TLS, "Expected tls/"),
-        ("quic/127.0.0.1:7447", TLS, "Expected tls/"),
         ("tls/127.0.0.1:7447#enable_mtls=false", TLS, "Expected tls/"),
         ("", TLS, "Expected tls/"),
     ],

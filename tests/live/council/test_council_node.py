@@ -12,7 +12,7 @@ import pytest
 from agents.auction import Consensus
 from fleet.bus.client import AnotherReplies, BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import ArmEvent, JobSpec, Status, StatusRequest, Submission, SubmissionReply
+from fleet.bus.protocol.auction import ArmEvent, JobSpec, Submission, SubmissionReply
 from fleet.bus.router import Router
 from fleet.errors import BusError
 from fleet.job import Place
@@ -109,9 +109,6 @@ def bus(tmp_path, small):
         def submit(*jobs):
             return ask(keys.of_jobs("f", "submit"), Submission(jobs), SubmissionReply)
 
-        def statuses():
-            return {each.job: each for each in ask(keys.of_jobs("f", "status"), StatusRequest(), Status).jobs}
-
         def kill(name):
             one = arms.pop(name)
             one.link.close()
@@ -135,7 +132,6 @@ def bus(tmp_path, small):
             ask=ask,
             endpoint=router.endpoint,
             submit=submit,
-            statuses=statuses,
             kill=kill,
             lose_journals=lose_journals,
             finished=finished,
@@ -159,23 +155,6 @@ def test_a_restarted_arm_knows_its_peers_before_it_replies_for_them(bus, monkeyp
 def settled(bus, *names):
     """Return whether every present arm knows that these jobs are finished."""
     return all(all(map(one.work_source.book.is_settled, names)) for one in bus.arms.values())
-
-
-@pytest.mark.ci_slow
-def test_submitted_jobs_are_allocated_to_several_arms_and_done_once(bus):
-    for name in ROSTER:
-        bus.arm(name)
-    jobs = (hold("a"), hold("b", "rack"), hold("c", "shelf"), hold("d"), hold("e", "rack", after=("a",)))
-    assert all(each.accepted for each in bus.submit(*jobs).jobs)
-    assert bus.serve(lambda: settled(bus, *"abcde"))
-    assert {name: each.state for name, each in bus.statuses().items()} == dict.fromkeys("abcde", "finished")
-    assert bus.serve(lambda: sum(bus.finished.values()) == 5)
-    assert bus.finished == Counter("abcde")
-    assert len({each.arm for each in bus.statuses().values()}) > 1, "one arm did it all"
-    assert bus.statuses()["e"].finished_s > bus.statuses()["a"].finished_s
-    assert not bus.submit(hold("a", "rack")).jobs[0].accepted, "names are unique"
-    assert not bus.submit(hold("z", after=("nothing",))).jobs[0].accepted
-    assert bus.submit(hold("a")).jobs[0].accepted, "an identical job is accepted again"
 
 
 @pytest.mark.ci_slow
