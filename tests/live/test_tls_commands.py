@@ -126,11 +126,6 @@ def test_a_monitor_can_watch(fleet):
     assert (now["auctioneers"][0]["auctioneer"], now["counts"]) == ("auctioneer", {"waiting": 1})
 
 
-def test_the_doctor_finds_a_fleet_with_access_control_healthy(fleet):
-    done = run("doctor", fleet.endpoint("monitor"))
-    assert (done.exit_code, "The fleet is healthy." in done.stdout) == (0, True), done.stdout
-
-
 @contextmanager
 def gateway(fleet, name):
     """The address of a gateway with the certificate of this one."""

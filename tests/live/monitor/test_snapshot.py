@@ -31,13 +31,6 @@ def test_present_is_token_and_fresh_state(token, age_s, spoke):
     assert arm.state_age_s == (pytest.approx(age_s, abs=1e-9) if spoke else None)
 
 
-def test_the_hottest_motor_is_named_by_its_joint():
-    seen = FleetView("f")
-    seen.update("a", state(), 0.0)
-    (arm,) = seen.snapshot(0.0).arms
-    assert (arm.hottest_c, arm.joint) == (52.5, 2)
-
-
 def scores(time_s, **difficulty):
     jobs, values = tuple(difficulty), tuple(difficulty.values())
     return DifficultyScores("a", 1, time_s, "v", jobs, values, (None,) * len(jobs))

@@ -1,6 +1,5 @@
 """The `watch` screen and command."""
 
-import json
 import os
 import re
 import signal
@@ -119,13 +118,6 @@ def test_without_a_terminal_tables_are_printed_until_stopped(fleet):
         finally:
             process.kill()
             process.communicate(timeout=PATIENCE_S)
-
-
-def test_a_snapshot_is_json(fleet):
-    done = commands.run("bus", "watch", "--endpoint", fleet.endpoint, "--json")
-    told = json.loads(done.stdout)
-    assert told["fleet"] == "f"
-    assert [(arm["arm"], arm["token"], arm["present"]) for arm in told["arms"]] == [("a", True, False)]
 
 
 def test_the_end_of_a_shift_is_told_when_all_have_left():
