@@ -1,6 +1,5 @@
 """Keys, messages and their documents: what is built is parsed back to the last bit, and rubbish is refused."""
 
-import ast
 import copy
 import json
 import math
@@ -409,35 +408,6 @@ def test_asyncapi_has_every_key_and_no_loose_end():
     for message in document["components"]["messages"].values():
         schema = {"$ref": message["payload"]["$ref"], "components": document["components"]}
         Draft202012Validator(schema).validate(message["examples"][0]["payload"])
-
-
-@pytest.mark.parametrize(
-    ("nodes", "role"),
-    [
-        (("arm/node", "consensus/node", "desk"), "arm"),
-        (("auction/node", "desk"), "auction"),
-    ],
-)
-def test_the_participants_publish_and_answer_as_the_contract_says(nodes, role):
-    """Read from their source: `link.publisher(keys.of_…(…, "topic"), Kind)` and `link.reply_to(…)`."""
-    source = "\n".join((ROOT / "fleet" / "live" / f"{node}.py").read_text(encoding="utf-8") for node in nodes)
-    found = {}
-    for call in ast.walk(ast.parse(source)):
-        if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) and len(call.args) > 1):
-            continue
-        if call.func.attr in ("publisher", "reply_to") and isinstance(call.args[0], ast.Call):
-            key = ast.unparse(call.args[0])
-            topic = re.search(r"'(\w+)'\)$", key)
-            place = {"asked_by_every_arm": role}.get(key.split(".")[1].split("(")[0]) or key.split("of_")[1]
-            found[place.split("(")[0], topic[1] if topic else "now"] = ast.unparse(call.args[1])
-    expected = {
-        (channel.role, channel.topic): channel.message.__name__
-        for channel in CHANNELS
-        if channel.message is not None
-        # Where there is no auctioneer, arms reply to outsiders.
-        and (channel.sender == {"arm": "arm", "auction": "auctioneer"}[role] or channel.role in keys.NAMELESS)
-    }
-    assert found == expected
 
 
 @pytest.mark.parametrize("channel", CHANNELS, ids=lambda channel: channel.name)
