@@ -156,16 +156,6 @@ def test_an_arm_that_was_away_learns_that_a_job_has_left(fleet_of):
     assert fleet.finished == dict.fromkeys(names, 1)
 
 
-def test_fewer_arms_than_a_majority_begin_no_job_and_an_isolated_one_knows_nothing_of_the_end(fleet_of):
-    fleet = fleet_of(True)
-    fleet.cut("arm_1", "arm_2")
-    fleet.submit(job("a", 3))
-    fleet.run(10.0)
-    assert not fleet.holder("a")
-    fleet.cut()
-    fleet.until(lambda: fleet.is_everywhere("a", "finished"))
-
-
 # Disks
 
 
