@@ -14,7 +14,7 @@ import pytest
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import ArmEvent, JobStatus
+from fleet.bus.protocol.auction import JobStatus
 from fleet.bus.protocol.operator import Alarm
 from fleet.errors import FleetError
 from fleet.live.auction.rounds import NOT_OFFERED
@@ -162,19 +162,6 @@ def test_an_alarm_of_a_monitor_that_has_exited_ends(gateway, router, monkeypatch
         wait_until(lambda: {"of it", "silence"} <= lasting())
     wait_until(lambda: "of it" not in lasting())
     assert "silence" in lasting()
-
-
-def test_events_of_unknown_kinds_are_counted_together(gateway, router):
-    with BusClient(router, "f") as link:
-        publish = link.publisher(keys.of_arm("f", "a+1", "event"), ArmEvent)
-        for number in range(200):
-            publish(ArmEvent("a+1", number, 1.0, f"kind {number}"))
-
-        def counted():
-            arms = gateway.ask("GET", "/v4/fleet")[2]["arms"]
-            return next((one["events"] for one in arms if one["arm"] == "a+1" and one["events"]), None)
-
-        assert set(wait_until(counted)) <= {"other"}
 
 
 async def receiver(replies, requests):

@@ -31,6 +31,13 @@ def test_present_is_token_and_fresh_state(token, age_s, spoke):
     assert arm.state_age_s == (pytest.approx(age_s, abs=1e-9) if spoke else None)
 
 
+def test_events_of_unknown_kinds_are_counted_together():
+    seen = FleetView("f")
+    for number in range(200):
+        seen.update("a", ArmEvent("a", number, 1.0, f"kind {number}" if number else "fault"), 0.0)
+    assert seen.snapshot(0.0).arms[0].events == {"fault": 1, "other": 199}
+
+
 def scores(time_s, **difficulty):
     jobs, values = tuple(difficulty), tuple(difficulty.values())
     return DifficultyScores("a", 1, time_s, "v", jobs, values, (None,) * len(jobs))
