@@ -265,6 +265,15 @@ def test_torque_goes_straight_but_jumps_with_the_load():
 # Faults and readings
 
 
+def test_only_faulted_arms_heat_nothing():
+    world, plants = shift(job("hold"), ticks=1)
+    state = initial(world)
+    state.mode[:] = FAULTED, IDLE
+    drive = plants["mujoco"].drive(world, state)
+    assert drive.current_sq[0].any(axis=-1).tolist() == [False, True]
+    assert not drive.friction_w[0, 0].any()
+
+
 def test_tick_zero_starts_afresh_and_looking_at_the_sensors_changes_nothing():
     world, plants = shift(job("sort", repetitions=90), job("hold"), ticks=3)
     plant, ends = plants["mujoco"], []
