@@ -264,7 +264,9 @@ def test_a_replay_publishes_the_same_messages_and_refuses_names_of_present_arms(
     first.write()
     messages = open_messages(tmp_path / "first")
     with Router() as router, Recording(router.endpoint, tmp_path / "second"), BusClient(router.endpoint, "f") as link:
-        serve_until(lambda: (tmp_path / "second" / CARD).exists(), link)
+        # The subscription may follow the card by some time.
+        begin = partial(link.publish, keys.of_auction("f", "boss", "operation"), operation(0))
+        wait_until(lambda: rows(tmp_path / "second", "operations"), begin)
         assert replay(messages, link, speed=100.0, stopped=lambda: False) == 60
         serve_until(lambda: rows(tmp_path / "second", "results") == 20, link)
         with BusClient(router.endpoint, "f") as other, pytest.raises(FleetError, match="on the bus already"):
