@@ -1,69 +1,21 @@
-"""Broadcasts for the tests of exchanges; routers and keys for those of security."""
+"""Routers and keys for the tests of security."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import fields
 from pathlib import Path
 
-import numpy as np
 import pytest
 import zenoh
 
-from fleet.bus.exchange.memory import Broadcast, PeerView
 from fleet.bus.router import Router, open_client
 from fleet.bus.security.access_control import of_arms
 from fleet.bus.security.certificates import make
 from fleet.bus.security.tls import Tls
-from fleet.offered_plans import PLANS
 from tests.waiting import PATIENCE_S
 
 ARMS = ("arm_0", "arm_1", "arm 2+*@")
 Connect = Callable[[str], zenoh.Session]
-
-
-def random_words(rng: np.random.Generator, arms: int, time_s: float, slots: int = 4) -> Broadcast:
-    """Broadcasts with awkward floats, unknown scores, empty slots, and jobs that come and go between ticks."""
-    jobs = [f"job {number}" for number in rng.choice(8, size=slots, replace=False)]
-    empty = rng.random(slots) < 0.25
-    for slot in np.flatnonzero(empty):
-        jobs[slot] = ""
-    difficulty = rng.random((arms, slots)) * 10.0 ** rng.integers(-300, 1, (arms, slots))
-    duration_s, peak_c, p_saturation = rng.random((3, arms, slots, PLANS)) * np.reshape(
-        [900.0, 80.0, 1.0], (3, 1, 1, 1)
-    )
-    for values in (difficulty, duration_s, peak_c, p_saturation):
-        values[rng.random(values.shape) < 0.3] = np.nan
-        values[:, empty] = np.nan
-    return Broadcast(
-        time_s=time_s,
-        mode=rng.integers(0, 3, arms),
-        temp_c=rng.normal(40.0, 10.0, (arms, 7)),
-        headroom_k=rng.normal(10.0, 20.0, arms),
-        busy_s=rng.uniform(0.0, 900.0, arms),
-        jobs=tuple(jobs),
-        difficulty=difficulty,
-        duration_s=duration_s,
-        peak_c=peak_c,
-        p_saturation=p_saturation,
-        twin=tuple(f"twin-{number}" for number in rng.integers(0, 2, arms)),
-    )
-
-
-def assert_equal(one: PeerView, other: PeerView) -> None:
-    """The same arrays to the last bit; NaN equals NaN."""
-    for name in (field.name for field in fields(PeerView)):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name, strict=True)
-
-
-@pytest.fixture
-def make_words() -> Callable[..., Broadcast]:
-    return random_words
-
-
-@pytest.fixture
-def assert_same() -> Callable[[PeerView, PeerView], None]:
-    return assert_equal
 
 
 def stranger(

@@ -5,6 +5,7 @@ import re
 import shutil
 import stat
 import subprocess
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from itertools import product
 from pathlib import Path
@@ -72,33 +73,18 @@ def allowed(rules: dict, who: str, flow: str, message: str, key: str) -> bool:
 
 
 @pytest.mark.parametrize("message", ["put", "liveliness_token", "declare_queryable", "reply"])
-def test_every_key_has_the_speakers_that_it_should_have(message):
-    """Of all keys there are: those of an arm belong to that arm, those of a policy to that policy, all others to the
-    auctioneer they name, or to any."""
-    roster = of_arms("f", ROSTER_ARMS, [RosterEntry("mine", "policy")])
+@pytest.mark.parametrize("auctioneer", [True, False])
+def test_every_key_has_the_speakers_that_it_should_have(message, auctioneer):
+    """Of all keys there are: those with a name belong to it, the others to the auctioneer; without one, to all arms."""
+    roster = of_arms("f", ROSTER_ARMS, [RosterEntry("mine", "policy")], auctioneer=auctioneer)
+    assert roster.by_consensus != auctioneer
     rules = access_control(roster)
     for key, participant in product(EVERY_KEY, roster.participants):
         place = keys.parse(key)
-        owner = "auctioneer" if place.role in NAMELESS else place.name
-        may = allowed(rules, participant.common_name, "ingress", message, key)
-        assert may == (participant.name == owner), (participant, key)
-        cache = f"{key}/@adv/pub/1/2"
-        assert allowed(rules, participant.common_name, "ingress", message, cache) == may, (participant, cache)
-
-
-def test_arms_without_an_auctioneer_answer_outsiders_and_nobody_else_does():
-    roster = of_arms("f", ROSTER_ARMS, auctioneer=False)
-    assert roster.by_consensus
-    assert not of_arms("f", ROSTER_ARMS).by_consensus
-    rules = access_control(roster)
-    for key, participant in product(EVERY_KEY, roster.participants):
-        place = keys.parse(key)
-        owner = participant.role == "arm" and (
-            place.role in NAMELESS or (place.role, place.name) == ("arm", participant.name)
-        )
-        owner |= (participant.role, place.role, place.name) == ("operator", "monitor", "operator")
-        for message in ("reply", "declare_queryable", "put"):
-            assert allowed(rules, participant.common_name, "ingress", message, key) == owner, (participant, key)
+        speaks = participant.role == ("auctioneer" if auctioneer else "arm")
+        may = speaks if place.role in NAMELESS else participant.name == place.name
+        for each in (key, f"{key}/@adv/pub/1/2"):
+            assert allowed(rules, participant.common_name, "ingress", message, each) == may, (participant, each)
 
 
 def test_what_ends_in_the_name_of_an_arm_is_asked_by_that_arm_alone():
@@ -165,9 +151,7 @@ def text_of(path: Path) -> str:
 
 
 @needs_openssl
-@pytest.mark.parametrize(
-    "file", ["router", "auctioneer", "submitter", "operator", "monitor", "recorder", "arm_0", "arm%202%2B%2A%40"]
-)
+@pytest.mark.parametrize("file", ["router", "operator", "arm%202%2B%2A%40"])
 def test_openssl_finds_each_certificate_good_for_its_own_end_alone(folder, file):
     """The second method: another implementation of X.509 reads and judges what ours has written."""
     path = folder / f"{file}.pem"
@@ -194,14 +178,10 @@ def test_openssl_finds_each_certificate_good_for_its_own_end_alone(folder, file)
 
 
 @needs_openssl
-def test_openssl_finds_an_authority_that_signs_certificates_and_no_other_authority(folder):
+def test_openssl_agrees_about_dates_and_authorities(folder, tmp_path):
     text = text_of(folder / "ca.pem")
     assert "X509v3 Basic Constraints: critical CA:TRUE, pathlen:0" in text
     assert "X509v3 Key Usage: critical Certificate Sign, CRL Sign" in text
-
-
-@needs_openssl
-def test_openssl_agrees_about_dates_and_authorities(folder, tmp_path):
     place = tmp_path / "other"
     make(place, of_arms("f", ["arm_0"]), days=30)
     verify = ("verify", "-x509_strict", "-CAfile", place / "ca.pem")
@@ -218,7 +198,7 @@ def test_openssl_agrees_about_dates_and_authorities(folder, tmp_path):
         check(place, "arm_0")
 
 
-@pytest.mark.parametrize("days", [1, 30, LONGEST_DAYS])
+@pytest.mark.parametrize("days", [1, LONGEST_DAYS])
 def test_a_certificate_lasts_as_long_as_was_said_and_no_longer_than_its_authority(tmp_path, days):
     now = datetime.now(UTC).replace(microsecond=0)
     new_authority(tmp_path, "f", now=now - timedelta(days=1))
@@ -233,7 +213,7 @@ def test_a_certificate_lasts_as_long_as_was_said_and_no_longer_than_its_authorit
         check(tmp_path, "a", now=now - timedelta(minutes=6))
 
 
-@pytest.mark.parametrize("days", [0, -1, LONGEST_DAYS + 1])
+@pytest.mark.parametrize("days", [0, LONGEST_DAYS + 1])
 def test_days_that_cannot_be_are_refused(tmp_path, days):
     with pytest.raises(BusError, match=f"lasts 1 to {LONGEST_DAYS} days"):
         make(tmp_path / "k", of_arms("f", ["a"]), days=days)
@@ -274,56 +254,53 @@ def test_keys_are_replaced_only_when_that_was_said(tmp_path):
     assert list(tmp_path.iterdir()) == [place]
 
 
-@pytest.mark.parametrize("what", ["notes.txt", "arm_0.pem"])
-def test_a_folder_with_something_else_is_left_alone(tmp_path, what):
+def test_a_folder_with_something_else_is_left_alone(tmp_path):
     place = tmp_path / "k"
     place.mkdir()
-    (place / what).write_text("mine")
+    (place / "arm_0.pem").write_text("mine")
     for overwrite in (False, True):
         with pytest.raises(BusError, match="is not a folder of keys"):
             make(place, of_arms("f", ["a"]), days=3, overwrite=overwrite)
-    assert contents(place) == {what: b"mine"}
+    assert contents(place) == {"arm_0.pem": b"mine"}
 
 
-@pytest.mark.parametrize("at", ["os.replace", "os.fsync", "pathlib.Path.rename"])
-@pytest.mark.parametrize("nth", [0, 3, 7])
-def test_what_breaks_off_leaves_what_was_there_and_nothing_half(tmp_path, monkeypatch, at, nth):
-    place = tmp_path / "k"
-    make(place, of_arms("f", ["a"]), days=3)
-    before = contents(place)
-    real = {"os.replace": os.replace, "os.fsync": os.fsync, "pathlib.Path.rename": Path.rename}[at]
-    calls = []
+@contextmanager
+def breaking(name, nth):
+    """A function of the system fails at its call of this number, from 0."""
+    module, real, calls = (Path, Path.rename, []) if name == "rename" else (os, getattr(os, name), [])
 
-    def breaks(*args):
+    def fail(*args):
         calls.append(args)
-        if len(calls) == 1 + (nth if at != "pathlib.Path.rename" else min(nth, 1)):
+        if len(calls) == 1 + nth:
             raise OSError(28, "No space left on device")
         return real(*args)
 
-    monkeypatch.setattr(at, breaks)
-    with pytest.raises(BusError, match="No space left"):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, name, fail)
+        with pytest.raises(BusError, match="No space left"):
+            yield
+
+
+@pytest.mark.parametrize(
+    ("name", "nth"),
+    [*((name, nth) for name in ("replace", "fsync") for nth in (0, 3, 7)), ("rename", 0), ("rename", 1)],
+)
+def test_what_breaks_off_leaves_what_was_there_and_nothing_half(tmp_path, name, nth):
+    place = tmp_path / "k"
+    make(place, of_arms("f", ["a"]), days=3)
+    before = contents(place)
+    with breaking(name, nth):
         make(place, of_arms("f", ["a", "b"]), days=3, overwrite=True)
-    monkeypatch.undo()
     assert contents(place) == before
     assert list(tmp_path.iterdir()) == [place]
 
 
 @pytest.mark.parametrize("nth", range(3))
-def test_adding_that_breaks_off_leaves_a_folder_that_can_be_added_to(tmp_path, monkeypatch, nth):
+def test_adding_that_breaks_off_leaves_a_folder_that_can_be_added_to(tmp_path, nth):
     place = tmp_path / "k"
     make(place, of_arms("f", ["a"]), days=3)
-    real, calls = os.replace, []
-
-    def breaks(*args):
-        calls.append(args)
-        if len(calls) == 1 + nth:
-            raise OSError(28, "No space left on device")
-        real(*args)
-
-    monkeypatch.setattr(os, "replace", breaks)
-    with pytest.raises(BusError, match="No space left"):
+    with breaking("replace", nth):
         add(place, RosterEntry("b", "arm"), days=3)
-    monkeypatch.undo()
     assert read_roster(place) == of_arms("f", ["a"])
     assert not [name for name in contents(place) if name.endswith(".tmp")]
     add(place, RosterEntry("b", "arm"), days=3)

@@ -20,7 +20,7 @@ from fleet.bus.router import Router
 from fleet.errors import BusError
 from fleet.live.supervisor import Supervisor
 from tests import commands
-from tests.waiting import PATIENCE_S, serve_until
+from tests.waiting import PATIENCE_S, serve_until, wait_until
 
 WAIT_S = 0.05
 
@@ -119,15 +119,23 @@ def raw(link):
     return link._session
 
 
-def test_an_answer_reaches_the_one_who_asked(bus):
+def refuse(_):
+    raise Refused("No clock here.")
+
+
+@pytest.mark.parametrize(
+    ("handle", "messages", "refused"),
+    [(lambda _: Clock(12.5, 60.0), [Clock(12.5, 60.0)], []), (refuse, [], ["No clock here."])],
+    ids=["reply", "refusal"],
+)
+def test_an_answer_reaches_the_one_who_asked(bus, handle, messages, refused):
     asker, teller = bus(), bus()
-    teller.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=12.5, speed=60.0))
+    teller.reply_to(keys.of_clock("f"), ClockRequest, handle)
     meet(asker, teller)
     got = []
     asker.query(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=PATIENCE_S)
     serve_until(lambda: got, asker, teller)
-    assert list(got[0].messages.values()) == [Clock(time_s=12.5, speed=60.0)]
-    assert not got[0].refused
+    assert ([*got[0].messages.values()], [*got[0].refused.values()]) == (messages, refused)
     assert got[0].took_s < PATIENCE_S
 
 
@@ -136,20 +144,6 @@ def test_a_question_to_nobody_is_over_at_once(bus):
     answers = asker.query_and_wait(keys.of_clock("f"), ClockRequest(), Clock, timeout_s=PATIENCE_S)
     assert not answers.messages
     assert answers.took_s < PATIENCE_S
-
-
-def test_a_refusal_is_told_in_words(bus):
-    asker, teller = bus(), bus()
-
-    def refuse(_):
-        raise Refused("No clock here.")
-
-    teller.reply_to(keys.of_clock("f"), ClockRequest, refuse)
-    meet(asker, teller)
-    got = []
-    asker.query(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=PATIENCE_S)
-    serve_until(lambda: got, asker, teller)
-    assert got[0].refused == {keys.of_clock("f"): "No clock here."}
 
 
 @pytest.mark.parametrize("part", ["payload", "attachment", "parameters"])
@@ -213,9 +207,7 @@ def test_two_that_ask_each_other_do_not_block(bus):
     ("payload", "said", "complaint"),
     [
         (b"{", encoding(ClockRequest), "Not a thermofleet.ClockRequest.v4"),
-        (b"\xff\xfe", encoding(ClockRequest), "Not a thermofleet.ClockRequest.v4"),
         (b"{}", "application/json;thermofleet.ClockRequest.v9", "encoded as"),
-        (b"{}", "text/plain", "encoded as"),
     ],
 )
 def test_a_malformed_question_is_answered_with_what_is_wrong(bus, payload, said, complaint):
@@ -259,13 +251,9 @@ def test_what_nobody_handles_pushes_out_the_oldest(bus):
     listener, sender, heard = bus(backlog=10), bus(), []
     listener.subscribe(keys.of_every_arm("f", "event"), ArmEvent, lambda arm, word: heard.append(word.number))
     meet(listener, sender)
-    for number in range(50):
+    for number in range(51):
         sender.publish(keys.of_arm("f", "a", "event"), ArmEvent(arm="a", number=number, time_s=0.0, kind="finish"))
-    sender.publish(keys.of_arm("f", "a", "event"), ArmEvent(arm="a", number=50, time_s=0.0, kind="finish"))
-    deadline_s = time.monotonic() + PATIENCE_S
-    patience = threading.Event()
-    while listener.overrun < 41 and time.monotonic() < deadline_s:
-        patience.wait(0.01)
+    wait_until(lambda: listener.overrun >= 41)
     listener.serve()
     assert heard == list(range(41, 51))
     assert listener.overrun == 41

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import warnings
-from dataclasses import fields, replace
+from dataclasses import fields
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,18 +17,17 @@ import networkx as nx
 import numpy as np
 import pytest
 import zenoh
-from hypothesis import HealthCheck, given
+from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.registry import make_policy
 from fleet.bus.exchange.channel import PERFECT, Channel, Partition
 from fleet.bus.exchange.memory import UNHEARD, Broadcast, Delivery, Exchange, PeerView
 from fleet.bus.exchange.zenoh import ZenohExchange, messages_of
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import DifficultyScores, State, decode, encode
 from fleet.bus.router import Router, open_client
-from fleet.env.allocation_v2 import parallel_env
 from fleet.errors import BusError
+from fleet.offered_plans import PLANS
 from tests.profiles import examples
 from tests.waiting import PATIENCE_S
 
@@ -74,12 +73,6 @@ def test_random_places_are_uniform_in_the_unit_square():
     assert abs(np.mean(hits) - expected) < 4 * np.sqrt(expected * (1 - expected) / 3000)
 
 
-def test_a_partition_of_unknown_arms_is_refused():
-    channel = Channel(partitions=(Partition(0.0, 1.0, (("arm_a",),)),))
-    with pytest.raises(ValueError, match=r"A partition names an unknown arm 'arm_a'.*Allowed: a, b"):
-        channel.check(FIVE)
-
-
 def test_a_partition_cuts_what_lies_between_groups_and_those_of_no_group_keep_together():
     cut = Partition(0.0, 1.0, (("a", "b"), ("c",))).cuts(FIVE)
     together = [{"a", "b"}, {"c"}, {"d", "e"}]
@@ -89,28 +82,18 @@ def test_a_partition_cuts_what_lies_between_groups_and_those_of_no_group_keep_to
 
 
 def test_only_the_default_is_perfect():
-    assert PERFECT.perfect
     assert Channel() == PERFECT
-    partition = Partition(0.0, 1.0, (("a",),))
-    for changes in (
-        {"topology": "ring"},
-        {"delay_s": 1.0},
-        {"jitter_s": 1.0},
-        {"loss": 0.1},
-        {"partitions": [partition]},
-    ):
-        assert not Channel(**changes).perfect
+    partitions = (Partition(0.0, 1.0, (("a",),)),)
+    others = ({"topology": "ring"}, {"delay_s": 1.0}, {"jitter_s": 1.0}, {"loss": 0.1}, {"partitions": partitions})
+    assert [Channel(**changes).perfect for changes in ({}, *others)] == [True] + 5 * [False]
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         ({"topology": "rign"}, "No topology 'rign'; did you mean 'ring'"),
-        ({"delay_s": -1.0}, "delay_s must be 0 to 86400"),
-        ({"delay_s": np.inf}, "delay_s must be 0 to 86400"),
         ({"delay_s": np.nan}, "delay_s must be 0 to 86400"),
         ({"jitter_s": -0.1}, "jitter_s must be 0 to 86400"),
-        ({"loss": 1.5}, "loss must be 0 to 1"),
         ({"loss": np.nan}, "loss must be 0 to 1"),
         ({"radius": -1.0}, "radius must be 0 to 2"),
         ({"radius": 0.3}, r"radius is for the topology random_geometric \(got 0.3 and complete\): give this topology"),
@@ -128,7 +111,6 @@ def test_a_channel_that_cannot_be_is_refused(arguments, said):
     [
         ((5.0, 5.0, (("a",),)), "must end after it begins"),
         ((np.nan, 5.0, (("a",),)), "must end after it begins"),
-        ((0.0, 5.0, ()), "needs groups"),
         ((0.0, 5.0, (("a",), ())), "needs groups"),
         ((0.0, 5.0, (("a", "b"), ("a",))), "names 'a' twice"),
     ],
@@ -212,14 +194,6 @@ def test_jitter_is_uniform():
     assert abs(delivery.delivered - links * sum(shares)) < 5 * spread
 
 
-def test_words_overtake_each_other_and_the_older_is_no_news():
-    delivery, known = shift(Channel(jitter_s=60.0), 60)
-    others = ~np.eye(3, dtype=bool)
-    changes = int((known[1:] > known[:-1])[:, others].sum()) + int(np.isfinite(known[0][others]).sum())
-    assert delivery.delivered > changes > 0
-    assert delivery.late == 0
-
-
 def test_more_loss_loses_the_same_words_and_more_and_jitter_loses_no_others():
     def heard(**changes) -> np.ndarray:
         _, known = shift(Channel(**changes), 100, seed=3)
@@ -233,13 +207,6 @@ def test_more_loss_loses_the_same_words_and_more_and_jitter_loses_no_others():
     assert few.late == delayed.late
     pairs = 100 * 6
     assert abs(few.late - 0.2 * pairs) < 5 * np.sqrt(0.2 * 0.8 * pairs)
-
-
-def test_each_link_draws_for_itself():
-    _, known = shift(Channel(loss=0.5), 40)
-    came = known == DT_S * np.arange(40)[:, None, None]
-    rows = [tuple(came[:, r, s]) for r in range(3) for s in range(3) if r != s]
-    assert len(set(rows)) == 6
 
 
 def test_partitions_cut_for_their_time_and_may_overlap():
@@ -274,41 +241,47 @@ def test_a_new_episode_forgets_what_was_known_and_what_was_on_its_way():
     assert (carry(delivery, 20.0, said_s)[others] == 0.0).all()
 
 
+def make_words(rng: np.random.Generator, arms: int, time_s: float, slots: int = 4) -> Broadcast:
+    """Broadcasts with awkward floats, unknown scores, empty slots, and jobs that come and go between ticks."""
+    jobs = [f"job {number}" for number in rng.choice(8, size=slots, replace=False)]
+    empty = rng.random(slots) < 0.25
+    for slot in np.flatnonzero(empty):
+        jobs[slot] = ""
+    difficulty = rng.random((arms, slots)) * 10.0 ** rng.integers(-300, 1, (arms, slots))
+    duration_s, peak_c, p_saturation = rng.random((3, arms, slots, PLANS)) * np.reshape(
+        [900.0, 80.0, 1.0], (3, 1, 1, 1)
+    )
+    for values in (difficulty, duration_s, peak_c, p_saturation):
+        values[rng.random(values.shape) < 0.3] = np.nan
+        values[:, empty] = np.nan
+    return Broadcast(
+        time_s=time_s,
+        mode=rng.integers(0, 3, arms),
+        temp_c=rng.normal(40.0, 10.0, (arms, 7)),
+        headroom_k=rng.normal(10.0, 20.0, arms),
+        busy_s=rng.uniform(0.0, 900.0, arms),
+        jobs=tuple(jobs),
+        difficulty=difficulty,
+        duration_s=duration_s,
+        peak_c=peak_c,
+        p_saturation=p_saturation,
+        twin=tuple(f"twin-{number}" for number in rng.integers(0, 2, arms)),
+    )
+
+
+def assert_same(one: PeerView, other: PeerView) -> None:
+    """The same arrays to the last bit; NaN equals NaN."""
+    for name in (field.name for field in fields(PeerView)):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name, strict=True)
+
+
 FOUR = ("a", "b", "c", "d")
 BIDS = ("duration_s", "peak_c", "p_saturation")
 
 
-def test_scores_go_to_the_slot_of_their_job(make_words):
-    exchange = Exchange(("s", "t"), Channel(delay_s=10.0))
-    words = replace(
-        make_words(np.random.default_rng(0), 2, 0.0, slots=3),
-        jobs=("a", "b", "c"),
-        difficulty=np.array([[1.0, 2.0, 3.0]] * 2),
-        p_saturation=np.array([[[0.1, 0.4], [0.2, 0.5], [0.3, 0.6]]] * 2),
-    )
-    exchange.share(words)
-    later = make_words(np.random.default_rng(1), 2, 10.0, slots=4)
-    heard = exchange.share(replace(later, jobs=("c", "", "x", "a")))
-    np.testing.assert_array_equal(heard.difficulty[0, 1], [3.0, np.nan, np.nan, 1.0])
-    np.testing.assert_array_equal(heard.p_saturation[0, 1], [[0.3, 0.6], [np.nan] * 2, [np.nan] * 2, [0.1, 0.4]])
-
-
-def test_on_a_ring_only_neighbours_are_heard(make_words):
-    exchange = Exchange(FOUR, Channel(topology="ring"))
-    rng = np.random.default_rng(1)
-    heard = [exchange.share(make_words(rng, 4, 10.0 * tick)) for tick in range(3)][-1]
-    across = np.array([[(r - s) % 4 == 2 for s in range(4)] for r in range(4)])
-    assert np.isinf(heard.age_s[across]).all()
-    assert (heard.mode[across] == UNHEARD).all()
-    assert np.isnan(heard.headroom_k[across]).all()
-    assert np.isnan(heard.difficulty[across]).all()
-    assert (heard.age_s[~across] == 0.0).all()
-    assert exchange.delivered == 3 * 8
-
-
-@examples(40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@examples(40)
 @given(ticks=st.integers(0, 4), dt_s=st.sampled_from([0.1, 1.0, 10.0]), seed=st.integers(0, 99))
-def test_a_delayed_word_is_the_word_of_then_under_the_names_of_now(make_words, ticks, dt_s, seed):
+def test_a_delayed_word_is_the_word_of_then_under_the_names_of_now(ticks, dt_s, seed):
     """Against a second method: look the word of t − delay up by hand."""
     rng = np.random.default_rng(seed)
     exchange = Exchange(FOUR, Channel(delay_s=ticks * dt_s))
@@ -322,6 +295,8 @@ def test_a_delayed_word_is_the_word_of_then_under_the_names_of_now(make_words, t
                 then = tick if receiver == sender else tick - ticks
                 if then < 0:
                     assert heard.age_s[receiver, sender] == np.inf
+                    assert heard.mode[receiver, sender] == UNHEARD
+                    assert np.isnan(heard.headroom_k[receiver, sender])
                     assert np.isnan(heard.difficulty[receiver, sender]).all()
                     continue
                 old = said[then]
@@ -336,22 +311,7 @@ def test_a_delayed_word_is_the_word_of_then_under_the_names_of_now(make_words, t
                         np.testing.assert_array_equal(actual, np.broadcast_to(expected, np.shape(actual)))
 
 
-def test_relabelling_the_arms_relabels_what_is_heard(make_words, assert_same):
-    order = [2, 0, 3, 1]
-    rng = np.random.default_rng(5)
-    channel = Channel(delay_s=10.0, partitions=(Partition(10.0, 30.0, (("a", "b"), ("c",))),))
-    plain, turned = Exchange(FOUR, channel), Exchange([FOUR[i] for i in order], channel)
-    for tick in range(5):
-        words = make_words(rng, 4, 10.0 * tick)
-        per_arm = ("mode", "temp_c", "headroom_k", "busy_s", "difficulty", *BIDS)
-        moved = replace(
-            words, **{f: getattr(words, f)[order] for f in per_arm}, twin=tuple(words.twin[i] for i in order)
-        )
-        one, other = plain.share(words), turned.share(moved)
-        assert_same(PeerView(**{f.name: getattr(one, f.name)[np.ix_(order, order)] for f in fields(PeerView)}), other)
-
-
-def test_a_delay_is_not_a_tick_longer_for_a_rounding(make_words):
+def test_a_delay_is_not_a_tick_longer_for_a_rounding():
     """0.1 + 0.2 > 0.3 in binary."""
     exchange = Exchange(FOUR, Channel(delay_s=0.2))
     rng = np.random.default_rng(0)
@@ -359,14 +319,8 @@ def test_a_delay_is_not_a_tick_longer_for_a_rounding(make_words):
     assert np.isfinite(exchange.share(make_words(rng, 4, 0.3)).age_s).all()
 
 
-def test_one_arm_alone_knows_itself(make_words):
-    heard = Exchange(["solo"]).share(make_words(np.random.default_rng(0), 1, 0.0))
-    assert heard.difficulty.shape == (1, 1, 4)
-    assert heard.age_s.tolist() == [[0.0]]
-
-
-def test_an_exchange_that_cannot_be_is_refused(make_words):
-    with pytest.raises(ValueError, match="unknown arm 'z'"):
+def test_an_exchange_that_cannot_be_is_refused():
+    with pytest.raises(ValueError, match=r"A partition names an unknown arm 'z'.*Allowed: a, b, c, d"):
         Exchange(FOUR, Channel(partitions=(Partition(0.0, 1.0, (("z",),)),)))
     with pytest.raises(ValueError, match="names"):
         Exchange(["a", "a"])
@@ -374,15 +328,7 @@ def test_an_exchange_that_cannot_be_is_refused(make_words):
         Exchange(FOUR, Channel(loss=0.5)).share(make_words(np.random.default_rng(0), 4, 0.0))
 
 
-def test_a_closed_exchange_says_so(make_words):
-    with Exchange(FOUR) as exchange:
-        pass
-    exchange.close()
-    with pytest.raises(BusError, match="closed"):
-        exchange.share(make_words(np.random.default_rng(0), 4, 0.0))
-
-
-def test_an_exchange_over_zenoh_stays_in_its_process(make_words):
+def test_an_exchange_over_zenoh_stays_in_its_process():
     """Its sessions have threads, which a copy, a pickle or a forked process does not have."""
     exchange = ZenohExchange(ARMS, "stays")
     for copied in (copy.deepcopy, pickle.dumps):
@@ -405,7 +351,7 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("channel", [Channel(), Channel(topology="ring", delay_s=10.0, loss=0.5)], ids=["all", "some"])
-def test_the_bus_carries_every_message_and_the_arms_know_what_the_memory_delivers(make_words, assert_same, channel):
+def test_the_bus_carries_every_message_and_the_arms_know_what_the_memory_delivers(channel):
     arms, rng, samples = tuple(f"arm {i}+*@" for i in range(12)), np.random.default_rng(2), queue.Queue()
     with ZenohExchange(arms, "same", channel=channel, timeout_s=PATIENCE_S) as bus:
         memory, said, heard = Exchange(arms, channel), [], []
@@ -474,17 +420,16 @@ def test_scores_and_bids_for_sixteen_jobs_fit_into_a_kilobyte() -> None:
         assert len(encode(scores)) <= 1024
 
 
-def test_an_exchange_takes_broadcasts_in_order(make_words):
+def test_an_exchange_takes_broadcasts_in_order_until_it_is_closed():
     with Exchange(ARMS) as exchange:
         exchange.begin(np.random.default_rng(0))
-        heard = exchange.share(make_words(np.random.default_rng(0), 3, 0.0))
+        exchange.share(make_words(np.random.default_rng(0), 3, 0.0))
         with pytest.raises(ValueError, match=r"-1 s after that of 0 s; begin\(\)"):
             exchange.share(make_words(np.random.default_rng(0), 3, -1.0))
-        assert exchange.arms == ARMS
         assert (exchange.delivered, exchange.late) == (6, 0)
-        assert heard.mode.dtype.kind == "i"
-        assert heard.difficulty.dtype == heard.p_saturation.dtype == heard.age_s.dtype == np.float64
     exchange.close()
+    with pytest.raises(BusError, match="closed"):
+        exchange.share(make_words(np.random.default_rng(0), 3, 0.0))
 
 
 def test_an_arm_is_on_the_bus_once():
@@ -499,25 +444,7 @@ def barrier(session: zenoh.Session) -> None:
     assert list(session.liveliness().get("thermofleet/v4/*/arm/*/alive", timeout=PATIENCE_S))
 
 
-def test_a_late_joiner_gets_the_last_word_and_who_said_it(make_words):
-    """With nothing but Zenoh: the caches answer a subscriber that was not there."""
-    samples: queue.Queue[zenoh.Sample] = queue.Queue()
-    with ZenohExchange(ARMS, "f", timeout_s=PATIENCE_S) as bus:
-        bus.share(make_words(np.random.default_rng(5), 3, 0.0))
-        with open_client(bus.endpoint or "", timeout_s=PATIENCE_S) as joiner:
-            history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
-            for topic in ("info", "difficulty"):
-                zenoh.ext.declare_advanced_subscriber(
-                    joiner, keys.of_every_arm("f", topic), samples.put, history=history
-                )
-            tokens = joiner.liveliness().get(keys.of_every_arm("f", "alive"), timeout=PATIENCE_S)
-            present = {keys.parse(str(reply.ok.key_expr)).name for reply in tokens if reply.ok}
-            heard = {str(samples.get(timeout=PATIENCE_S).key_expr) for _ in range(6)}
-    assert present == set(ARMS)
-    assert heard == {keys.of_arm("f", arm, topic) for arm in ARMS for topic in ("info", "difficulty")}
-
-
-def test_closing_leaves_no_thread_and_no_port(make_words):
+def test_closing_leaves_no_thread_and_no_port():
     threads = set(threading.enumerate())
     bus = ZenohExchange(ARMS, "f", timeout_s=PATIENCE_S).open()
     endpoint = bus.endpoint or ""
@@ -533,17 +460,12 @@ def test_closing_leaves_no_thread_and_no_port(make_words):
         bus.open()
 
 
-def test_an_error_inside_the_block_is_the_one_that_is_seen():
-    with pytest.raises(ZeroDivisionError), ZenohExchange(ARMS, "f"):
-        _ = 1 / 0
-
-
-@pytest.mark.parametrize("ending", ["bus.close()", "pass", "del bus", "raise SystemExit(0)"])
+@pytest.mark.parametrize("ending", ["pass", "del bus", "raise SystemExit(0)"])
 def test_a_process_ends_however_it_leaves_the_exchange(ending):
     """A Zenoh session that is not closed keeps a process from ending."""
     program = f"""
 import numpy as np
-from fleet.bus.exchange.memory import Broadcast
+from fleet.bus.exchange.memory import UNHEARD, Broadcast, Delivery, Exchange, PeerView
 from fleet.bus.exchange.zenoh import ZenohExchange
 bus = ZenohExchange(["a", "b"], "f", timeout_s=120.0)
 one, plan = np.ones((2, 1)), np.ones((2, 1, 1))
@@ -563,54 +485,12 @@ print(heard.difficulty.sum(), flush=True)
     assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "4.0", "")
 
 
-@pytest.mark.parametrize("endpoint", ["tcp/10.0.0.1:7447", "tcp/0.0.0.0:7447"])
-def test_an_arm_connects_to_this_machine_alone(endpoint):
-    with pytest.raises(BusError, match="not on loopback"):
-        ZenohExchange(ARMS, "f", endpoint)
-
-
 def test_what_cannot_be_is_refused():
+    with pytest.raises(BusError, match="not on loopback"):
+        ZenohExchange(ARMS, "f", "tcp/0.0.0.0:7447")
     with pytest.raises(ValueError, match="timeout_s"):
         ZenohExchange(ARMS, "f", timeout_s=0.0)
     with pytest.raises(ValueError, match="name"):
         ZenohExchange(ARMS, "")
     with pytest.raises(ValueError, match="names"):
         ZenohExchange(["a", "a"], "f")
-
-
-def test_no_router_is_an_error_and_leaves_nothing_open():
-    with Router() as router:
-        endpoint = router.endpoint
-    threads = set(threading.enumerate())
-    with pytest.raises(BusError, match="No router answered"):
-        ZenohExchange(ARMS, "f", endpoint, timeout_s=0.2).open()
-    assert set(threading.enumerate()) <= threads
-
-
-BUS_FOUR = ("arm_0", "arm_1", "arm_2", "arm_3")
-CHANNELS = {
-    "perfect": Channel(),
-    "ring": Channel(
-        topology="ring",
-        delay_s=10.0,
-        jitter_s=15.0,
-        loss=0.2,
-        partitions=(Partition(60.0, 120.0, (("arm_0", "arm_1"), ("arm_2", "arm_3"))),),
-    ),
-}
-
-
-@pytest.mark.parametrize("channel", CHANNELS.values(), ids=CHANNELS)
-def test_the_same_seed_gives_the_same_awards_over_either(small, channel):
-    def shift(exchange: Exchange) -> tuple[list[str], int]:
-        env = parallel_env(small.Shifts(arms=4, jobs=20, ticks=60), exchange=exchange, keep_events=True)
-        policy = make_policy("least_difficulty")
-        env.reset(seed=3)
-        while env.agents:
-            env.step(policy.act(env.knowledge()))
-        return [repr(event) for event in env.events], env.messages
-
-    with ZenohExchange(BUS_FOUR, "trace", channel=channel, timeout_s=PATIENCE_S) as bus:
-        over_zenoh = shift(bus)
-    assert over_zenoh == shift(Exchange(BUS_FOUR, channel))
-    assert sum("award" in event for event in over_zenoh[0]) > 5

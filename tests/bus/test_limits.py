@@ -153,27 +153,7 @@ def test_without_a_policy_in_the_roster_no_request_may_be_large():
     assert largest == [(LIMIT, 3 * LIMIT), *2 * [(64 * LIMIT, 65 * LIMIT)]]
 
 
-def test_telemetry_too_often_is_thinned_to_the_limit(connect):
-    """At a steady flood one word passes in every 1/25 s: five of them take at least four gaps."""
-    heard: queue.Queue[float] = queue.Queue()
-    key = keys.of_arm("f", "arm_0", "state")
-    listener = connect("monitor").declare_subscriber(key, lambda _: heard.put(time.monotonic()))
-    settled(connect("monitor"))
-    said = 0
-    began_s = time.monotonic()
-    while heard.qsize() < 5 and time.monotonic() - began_s < PATIENCE_S:
-        connect("arm_0").put(key, b"state")
-        said += 1
-    assert heard.qsize() >= 5
-    settled(connect("arm_0"))
-    took_s = time.monotonic() - began_s
-    assert took_s >= 4 / STATE_HZ
-    assert heard.qsize() <= took_s * STATE_HZ + 1
-    assert said > 10 * heard.qsize()
-    listener.undeclare()
-
-
-def test_a_flood_of_telemetry_takes_nothing_from_other_words_and_other_arms(connect):
+def test_a_flood_of_telemetry_is_thinned_and_takes_nothing_from_other_words_and_other_arms(connect):
     heard: queue.Queue[str] = queue.Queue()
     listener = connect("monitor").declare_subscriber(
         "thermofleet/v4/f/**", lambda sample: heard.put(str(sample.key_expr))
@@ -182,6 +162,7 @@ def test_a_flood_of_telemetry_takes_nothing_from_other_words_and_other_arms(conn
     settled(connect("arm_1"))
     flood, other = keys.of_arm("f", "arm_0", "state"), keys.of_arm("f", "arm_1", "state")
     difficulty, end = keys.of_arm("f", "arm_0", "difficulty"), keys.of_arm("f", "arm_0", "info")
+    began_s = time.monotonic()
     for _ in range(50):
         for _ in range(20):
             connect("arm_0").put(flood, b"state")
@@ -194,28 +175,12 @@ def test_a_flood_of_telemetry_takes_nothing_from_other_words_and_other_arms(conn
         got.append(heard.get(timeout=PATIENCE_S))
     assert got.count(difficulty) == 50
     assert got.count(other) == 1
-    assert got.count(flood) < 500
+    assert 1 <= got.count(flood) <= 1 + STATE_HZ * (time.monotonic() - began_s)
     listener.undeclare()
 
 
-def test_without_a_rate_every_word_passes():
-    """As an exchange needs it, which says in a second what a fleet says in an hour."""
-    key = keys.of_arm("f", "arm_0", "state")
-    heard: queue.Queue[int] = queue.Queue()
-    with (
-        Router() as router,
-        open_client(router.endpoint, timeout_s=PATIENCE_S) as monitor,
-        open_client(router.endpoint, timeout_s=PATIENCE_S) as arm,
-    ):
-        listener = monitor.declare_subscriber(key, lambda sample: heard.put(len(sample.payload)))
-        settled(monitor)
-        for size in range(1000):
-            say(arm, key, size)
-        assert [heard.get(timeout=PATIENCE_S) for _ in range(1000)] == list(range(1000))
-        listener.undeclare()
-
-
-@pytest.mark.parametrize("wrong", [0.0, -1.0, float("nan")])
-def test_a_rate_that_cannot_be_is_refused(wrong):
+def test_without_a_rate_every_word_passes_and_a_rate_that_cannot_be_is_refused():
+    """An exchange says in a second what a fleet says in an hour."""
+    assert ["downsampling" in limits(state_hz=hz) for hz in (None, 1.0)] == [False, True]
     with pytest.raises(ValueError, match="state_hz must be > 0"):
-        Router(state_hz=wrong)
+        Router(state_hz=float("nan"))

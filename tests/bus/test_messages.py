@@ -1,6 +1,5 @@
 """Keys, messages and their documents: what is built is parsed back to the last bit, and rubbish is refused."""
 
-import ast
 import copy
 import json
 import math
@@ -12,6 +11,7 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
+from msgspec.structs import replace
 
 from docs.bus_contract import EXAMPLES, asyncapi, descriptions, schema_document
 from docs.tables import fill_tables, main
@@ -29,9 +29,7 @@ from fleet.bus.protocol.messages import (
     decode,
     encode,
     encoding,
-    schema,
 )
-from fleet.bus.protocol.operator import ControlRequest
 from fleet.errors import is_name
 from fleet.events import EVENT_KINDS, MEANINGS
 from fleet.live.arm.body import _REPORTED
@@ -115,8 +113,6 @@ def test_keys_are_written_as_the_design_says(built, written):
         "thermofleet/v4/f/arm/*/state",
         "thermofleet/v4/**",
         "thermofleet/v4/f/arm//state",
-        "thermofleet/v4//arm/a/state",
-        "thermofleet/v4/f/arm/a/state/x",
         "thermofleet/v4/f/arm/a/announce",
         "thermofleet/v4/f/auction/a/lease",
         "thermofleet/v4/f/auction/a/lease/*",
@@ -125,7 +121,6 @@ def test_keys_are_written_as_the_design_says(built, written):
         "thermofleet/v4/f/jobs/a/submit",
         "thermofleet/v4/f/arm/state",
         "thermofleet/v4/f/arm/a%zz/state",
-        "thermofleet/v4/f/arm/%ff/state",
         "thermofleet/v4/f/arm/%61/state",
         "thermofleet/v4/f/arm/a%2f/state",
         "thermofleet/v4/@f/arm/a/state",
@@ -179,17 +174,12 @@ def test_names_that_cannot_be_written_are_refused(name):
         keys.of_auction(name, "a", "result")
 
 
-def test_a_key_that_was_read_before_is_not_taken_apart_again_unless_it_is_very_long():
-    short, long = (keys.of_arm("f", name, "state") for name in ("arm_0", "机" * 100))
-    assert keys.parse(short) is keys.parse(short)
-    assert keys.parse(long) == keys.parse(long)
-    assert keys.parse(long) is not keys.parse(long)
-
-
-def test_many_keys_fill_no_memory():
+def test_neither_many_nor_long_keys_fill_the_memory():
     for i in range(2 * keys.MAX_CACHED):
         keys.parse(keys.of_arm("f", f"arm_{i}", "state"))
     assert keys._parse_cached.cache_info().currsize == keys.MAX_CACHED
+    long = keys.of_arm("f", "机" * 100, "state")
+    assert keys.parse(long) is not keys.parse(long)
 
 
 numbers = st.floats(-1e12, 1e12)
@@ -240,27 +230,18 @@ def test_what_is_said_arrives_to_the_last_bit(message):
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_no_number_is_said_that_is_none(bad):
-    with pytest.raises(ValueError, match="time_s"):
-        State("a", 0, bad, "idle", (20.0,), 40.0)
-    with pytest.raises(ValueError, match="temp_c"):
-        State("a", 0, 0.0, "idle", (20.0, bad), 40.0)
-    with pytest.raises(ValueError, match="headroom_k"):
-        State("a", 0, 0.0, "idle", (20.0,), bad)
-    with pytest.raises(ValueError, match="difficulty"):
-        DifficultyScores("a", 0, 0.0, "", ("j",), (bad,), (None,))
-    with pytest.raises(ValueError, match="p_saturation"):
-        DifficultyScores("a", 0, 0.0, "", ("j",), (None,), (bad,))
-
-
-def changed(message, **changes):
-    fields = json.loads(encode(message))
-    for name, value in changes.items():
-        if value is ...:
-            del fields[name]
-        else:
-            fields[name] = value
-    return json.dumps(fields).encode()
+@pytest.mark.parametrize(
+    ("message", "field", "value"),
+    [
+        (STATE, "time_s", lambda bad: bad),
+        (STATE, "temp_c", lambda bad: (20.0, bad)),
+        (EXAMPLES[DifficultyScores], "difficulty", lambda bad: (bad,)),
+    ],
+    ids=["number", "list", "unknown or a number"],
+)
+def test_no_number_is_said_that_is_none(message, field, value, bad):
+    with pytest.raises(ValueError, match=rf"\.{field} must be finite"):
+        replace(message, **{field: value(bad)})
 
 
 @pytest.mark.parametrize(
@@ -272,15 +253,7 @@ def changed(message, **changes):
         b"{",
         b"\xff\xfe",
         b"[" * 100_000,
-        changed(STATE, headroom_k=None),
-        changed(STATE, temp_c=[40.0, None]),
-        changed(STATE, temp_c="hot"),
-        changed(STATE, time_s=...),
-        changed(STATE, mode="asleep"),
-        changed(STATE, mode=1),
-        changed(STATE, tick=-1),
-        changed(STATE, tick=1.5),
-        changed(STATE, arm=""),
+        encode(STATE).replace(b"working", b"asleep"),
         encode(STATE).replace(b"18.5", b"NaN"),
         encode(STATE).replace(b"18.5", b"1e999"),
     ],
@@ -290,25 +263,9 @@ def test_a_malformed_state_is_refused_with_words(payload):
         received(State, payload, "arm_0")
 
 
-def test_what_a_later_version_adds_is_ignored():
-    assert received(State, changed(STATE, mood="good"), "arm_0") == STATE
-
-
-def test_an_integer_is_a_number():
-    assert received(State, changed(STATE, headroom_k=18), "arm_0").headroom_k == 18.0
-
-
-def test_a_schema_has_a_version():
-    assert schema(Info) == "thermofleet.Info.v4"
+def test_an_integer_is_a_number_and_an_encoding_has_a_version():
+    assert received(State, encode(STATE).replace(b"18.5", b"18"), "arm_0").headroom_k == 18.0
     assert encoding(State) == "application/json;thermofleet.State.v4"
-
-
-@pytest.mark.parametrize("action", ["pause", "resume"])
-@pytest.mark.parametrize("arm", ["", "x" * 513])
-def test_the_arm_of_a_pause_has_the_bounds_of_a_name(action, arm):
-    request = {"request": "1", "action": {"action": action, "arm": arm}}
-    with pytest.raises(MalformedMessage, match="length"):
-        decode(ControlRequest, json.dumps(request).encode())
 
 
 ROOT = Path(__file__).parents[2]
@@ -344,12 +301,9 @@ def places(value, path=()):
         yield from places(part, (*path, name))
 
 
-def test_every_word_has_an_example():
-    assert set(EXAMPLES) == set(MESSAGES)
-
-
-def test_the_schemas_are_schemas():
+def test_the_schemas_are_schemas_and_every_word_has_an_example():
     Draft202012Validator.check_schema(DOCUMENT)
+    assert set(EXAMPLES) == set(MESSAGES)
 
 
 @pytest.mark.parametrize("word", NAMED)
@@ -456,35 +410,6 @@ def test_asyncapi_has_every_key_and_no_loose_end():
         Draft202012Validator(schema).validate(message["examples"][0]["payload"])
 
 
-@pytest.mark.parametrize(
-    ("nodes", "role"),
-    [
-        (("arm/node", "consensus/node", "desk"), "arm"),
-        (("auction/node", "desk"), "auction"),
-    ],
-)
-def test_the_participants_publish_and_answer_as_the_contract_says(nodes, role):
-    """Read from their source: `link.publisher(keys.of_…(…, "topic"), Kind)` and `link.reply_to(…)`."""
-    source = "\n".join((ROOT / "fleet" / "live" / f"{node}.py").read_text(encoding="utf-8") for node in nodes)
-    found = {}
-    for call in ast.walk(ast.parse(source)):
-        if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) and len(call.args) > 1):
-            continue
-        if call.func.attr in ("publisher", "reply_to") and isinstance(call.args[0], ast.Call):
-            key = ast.unparse(call.args[0])
-            topic = re.search(r"'(\w+)'\)$", key)
-            place = {"asked_by_every_arm": role}.get(key.split(".")[1].split("(")[0]) or key.split("of_")[1]
-            found[place.split("(")[0], topic[1] if topic else "now"] = ast.unparse(call.args[1])
-    expected = {
-        (channel.role, channel.topic): channel.message.__name__
-        for channel in CHANNELS
-        if channel.message is not None
-        # Where there is no auctioneer, arms reply to outsiders.
-        and (channel.sender == {"arm": "arm", "auction": "auctioneer"}[role] or channel.role in keys.NAMELESS)
-    }
-    assert found == expected
-
-
 @pytest.mark.parametrize("channel", CHANNELS, ids=lambda channel: channel.name)
 def test_a_key_is_used_as_the_registry_says_or_not_at_all(channel):
     key = channel.address.format(fleet="f", arm="a", auctioneer="a", policy="a", monitor="a", peer="b")
@@ -530,16 +455,3 @@ def test_every_kind_of_event_has_a_meaning_and_live_ones_are_those_that_arms_rep
     assert live == {*_REPORTED, "award", "finish", "return", "break", "break_end"}
     page = Path("docs/bus/messages.md").read_text(encoding="utf-8")
     assert all(f"| `{kind}` | {meaning.text} | {meaning.value} |" in page for kind, meaning in MEANINGS.items())
-
-
-def test_the_table_of_a_job_has_the_unit_of_every_bounded_field():
-    page = Path("docs/bus/messages.md").read_text(encoding="utf-8")
-    rows = [line.split(" | ") for line in page.partition("### JobSpec")[2].partition("### ")[0].splitlines()]
-    units = {row[0].strip("| `"): row[2] for row in rows if len(row) == 5}
-    assert {name: units[name].strip() for name in ("payload_kg", "force_n", "dwell_s", "due_s", "value")} == {
-        "payload_kg": "kg",
-        "force_n": "N",
-        "dwell_s": "s",
-        "due_s": "s",
-        "value": "",
-    }

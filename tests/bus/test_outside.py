@@ -147,13 +147,15 @@ class Outsider:
                 key, said = str(reply.ok.key_expr), str(reply.ok.encoding)
                 self.validate(name, key, said, reply.ok.payload.to_bytes())
 
-    def request(self, name: str, message: str, **parameters: str) -> None:
-        """Send a request that is in no fleet's way: the example of the contract, or an empty one."""
-        key = CHANNELS[name][0].format(fleet=self.fleet, **parameters)
-        encoding = API["components"]["messages"][message]["x-zenoh"]["encoding"]
-        payload = json.dumps({**EXAMPLES[message], **REQUESTS[message]}).encode()
-        self.validate(name, key, encoding, payload)
-        self.ask(name, key, encoding, payload)
+    def request(self, *names: str) -> None:
+        """Send requests that are in no fleet's way: examples of the contract, with these contents."""
+        for name in names:
+            message, content = REQUESTS[name]
+            key = CHANNELS[name][0].format(fleet=self.fleet, arm="*", peer="spare")
+            encoding = API["components"]["messages"][message]["x-zenoh"]["encoding"]
+            payload = json.dumps({**EXAMPLES[message], **content}).encode()
+            self.validate(name, key, encoding, payload)
+            self.ask(name, key, encoding, payload)
 
     def missing(self, channels: set[str]) -> dict[str, set[str]]:
         """Messages of channels that were not seen; a refusal need not be."""
@@ -163,16 +165,21 @@ class Outsider:
 
 JOB = {"name": "extra", "kind": "hold", "places": ["bench"], "repetitions": 1, "payload_kg": 0.5, "due_s": None}
 REQUESTS = {
-    "Submission": {"jobs": [JOB]},
-    "StatusRequest": {"jobs": []},
-    "ClockRequest": {},
-    "QuoteRequest": {"jobs": [JOB], "dry_run": True},
-    "Claim": {"arm": "spare", "number": 1, "entries": [], "outcomes": [], "jobs": [], "space": []},
-    "ClearRequest": {"arm": "spare"},
-    "CellRequest": {},
-    "ResetRequest": {},
-    "ControlRequest": {"request": "extra", "action": {"action": "resume"}},
+    "jobs_submit": ("Submission", {"jobs": [JOB]}),
+    "jobs_status": ("StatusRequest", {"jobs": []}),
+    "jobs_control": ("ControlRequest", {"request": "extra", "action": {"action": "resume"}}),
+    "jobs_cell": ("CellRequest", {}),
+    "clock_now": ("ClockRequest", {}),
+    "arm_quote": ("QuoteRequest", {"jobs": [JOB], "dry_run": True}),
+    "arm_reset": ("ResetRequest", {}),
+    "arm_claim": (
+        "Claim",
+        {"arm": "spare", "number": 1, "entries": [], "outcomes": [], "jobs": [], "space": []},
+    ),
+    "jobs_clear": ("ClearRequest", {"arm": "spare"}),
 }
+EVERYWHERE = ("jobs_submit", "jobs_status", "jobs_control", "jobs_cell", "clock_now", "arm_quote")
+"""Requests that fleets with and without an auctioneer reply to."""
 
 
 @pytest.fixture(scope="module")
@@ -249,21 +256,13 @@ def test_a_simulated_shift_is_as_the_contract_says(folder, port):
 def test_a_live_fleet_is_as_the_contract_says(folder, port):
     words = ("up", folder / "cell.toml", "--difficulty", "blind", "--speed", 20, "--jobs", "none", "--port", port)
     words += ("--policy", "bus:mine", "--out", folder / "up")
-    channels = (
-        set(CHANNELS) - CONSENSUS - GATEWAY - {"jobs_clear"}
-    )  # all arms are present, and say themselves where they are
+    channels = set(CHANNELS) - CONSENSUS - GATEWAY - {"jobs_clear"}  # all arms are present and state where they are
     with started(folder, *words) as fleet, outside(port, "cell") as outsider, policy(port):
         deadline_s = time.monotonic() + PATIENCE_S
         while outsider.missing(channels) and fleet.poll() is None and time.monotonic() < deadline_s:
             outsider.work()
             if outsider.seen["auction_alive"]:
-                outsider.request("jobs_submit", "Submission")
-                outsider.request("jobs_status", "StatusRequest")
-                outsider.request("clock_now", "ClockRequest")
-                outsider.request("arm_quote", "QuoteRequest", arm="*")
-                outsider.request("jobs_control", "ControlRequest")
-                outsider.request("jobs_cell", "CellRequest")
-                outsider.request("arm_reset", "ResetRequest", arm="*")
+                outsider.request(*EVERYWHERE, "arm_reset")
     assert not outsider.missing(channels), (folder / "up.log").read_text()
     assert not any(outsider.seen[name] for name in CONSENSUS)
 
@@ -273,8 +272,7 @@ def test_a_fleet_without_an_auctioneer_is_as_the_contract_says(folder, port):
     """Two of three arms are there, a majority; in the name of the third the outsider claims nothing."""
     at = ("--endpoint", f"tcp/127.0.0.1:{port}", "--difficulty", "blind", "--speed", 20, "--policy", "consensus")
     here = ("--jobs", "none", "--journal", folder / "journals")
-    channels = {*ARM, "arm_event", "arm_quote", *CONSENSUS, "jobs_submit", "jobs_status", "clock_now"}
-    channels |= {"jobs_control", "jobs_cell"}
+    channels = {*ARM, "arm_event", *CONSENSUS, *EVERYWHERE}
     with ExitStack() as stack:
         stack.enter_context(started(folder, "bus", "router", "--port", port))
         outsider = stack.enter_context(outside(port, "cell"))
@@ -287,16 +285,10 @@ def test_a_fleet_without_an_auctioneer_is_as_the_contract_says(folder, port):
         while outsider.missing(channels) and time.monotonic() < deadline_s:
             outsider.work()
             if outsider.seen["arm_bid"]:
-                outsider.request("jobs_submit", "Submission")
-                outsider.request("jobs_status", "StatusRequest")
-                outsider.request("clock_now", "ClockRequest")
-                outsider.request("jobs_control", "ControlRequest")
-                outsider.request("jobs_cell", "CellRequest")
-                outsider.request("arm_quote", "QuoteRequest", arm="*")
-                outsider.request("arm_claim", "Claim", arm="*", peer="spare")
+                outsider.request(*EVERYWHERE, "arm_claim")
         token.undeclare()
         while outsider.missing({"jobs_clear"}) and time.monotonic() < deadline_s:
             outsider.work()
-            outsider.request("jobs_clear", "ClearRequest")
+            outsider.request("jobs_clear")
     assert not outsider.missing({*channels, "jobs_clear"}), (folder / "arm.log").read_text()
     assert not any(seen for name, seen in outsider.seen.items() if name.startswith("auction"))

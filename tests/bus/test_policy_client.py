@@ -19,9 +19,6 @@ from docs.bus_contract import EXAMPLES
 from fleet.bus.protocol.messages import MOST_BYTES, decode, encoding
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES, ActReply, ActRequest
 from fleet.bus.router import Router, open_client
-from fleet.bus.security.access_control import RosterEntry, of_arms
-from fleet.bus.security.certificates import make
-from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
 from fleet.live import policy_client
 from fleet.live.policy_client import PolicyClient
@@ -156,21 +153,6 @@ def test_a_reply_that_cannot_be_used_is_an_error_within_the_limit(router, served
     assert policy._client._session is None  # a failed decision ends the connection
 
 
-def test_a_flood_of_replies_is_not_waited_for(router):
-    held = []
-
-    def flood(query):
-        held.append(query)  # so that it is not finished
-        for _ in range(3):
-            query.reply(str(query.key_expr), '{"actions": {}}', encoding=ACT_REPLY)
-
-    with open_client(router.endpoint, timeout_s=PATIENCE_S) as impostor:
-        impostor.declare_queryable(KEY, flood, complete=True)
-        with refused("Several processes reply as policy 'mine'"):
-            client(router).act(seen())
-    assert len(held) == 1
-
-
 def test_a_decision_without_a_valid_reply_is_requested_again(router, served):
     broken = served("nonsense")
     policy = client(router)
@@ -221,26 +203,6 @@ def test_large_fleets_fit_and_larger_ones_are_told_to(router, served):
     assert MOST_BYTES < size < MOST_REQUEST_BYTES
     with refused("observations of 64 arms have .* bytes, and a request to a policy at most 4,194,304"):
         client(router, LIMIT_S).act(seen(64, 256))
-
-
-def test_with_certificates_the_auctioneer_alone_asks_and_the_policy_alone_replies(tmp_path):
-    folder = tmp_path / "keys"
-    make(folder, of_arms("f", ["arm_0"], [RosterEntry("mine", "policy"), RosterEntry("other", "policy")]), days=1)
-    with Router(tls=Tls(folder, "router")) as router:
-
-        def asked(who: str) -> dict[str, int]:
-            endpoint = Tls(folder, who).endpoint(router.endpoint)
-            return PolicyClient("mine", fleet="f", endpoint=endpoint, limit_s=PATIENCE_S).act(seen())
-
-        with open_client(router.endpoint, timeout_s=PATIENCE_S, tls=Tls(folder, "other")) as other:
-            Server(other, '{"actions": {}}')
-            with pytest.raises(BusError, match="No process serves"):
-                asked("auctioneer")
-        with open_client(router.endpoint, timeout_s=PATIENCE_S, tls=Tls(folder, "mine")) as session:
-            Server(session, '{"actions": {"arm_0": 2}}')
-            assert asked("auctioneer") == {"arm_0": 2}
-            with pytest.raises(BusError, match=r"'monitor:monitor' may not query .* certificate of the role auc"):
-                asked("monitor")
 
 
 def test_a_process_that_leaves_its_client_open_ends(router, served):

@@ -50,7 +50,6 @@ from fleet.ros2.node import NO_HASH, Node, Topic, attachment, gid, node_token, p
 from tests.profiles import examples
 from tests.waiting import PATIENCE_S
 
-STORES = {name: get_typestore(Stores[f"ROS2_{name}"]) for name in ("HUMBLE", "JAZZY", "LYRICAL")}
 UNHURRIED = examples(50)
 """The first message of a kind builds its reader."""
 
@@ -118,11 +117,6 @@ def same(one, other):
     return np.array_equal(np.asarray(one, float), np.asarray(other, float), equal_nan=True)
 
 
-def test_the_hash_of_a_string_is_the_published_one():
-    """Origin: github.com/ros2/rmw_zenoh, docs/design.md, the key of the topic `chatter`."""
-    assert type_hash("std_msgs/msg/String") == "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
-
-
 def test_the_hash_of_a_joint_state_is_the_published_one():
     """Origin: `ros2 topic info --verbose` of joint_state_broadcaster's /joint_states, as found in users' reports."""
     assert type_hash(JOINT_STATE) == "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"
@@ -130,7 +124,8 @@ def test_the_hash_of_a_joint_state_is_the_published_one():
 
 @pytest.mark.parametrize("kind", [JOINT_STATE, DIAGNOSTICS])
 def test_the_types_are_the_same_in_every_version(kind):
-    assert {store.hash_rihs01(kind) for store in STORES.values()} == {type_hash(kind)}
+    stores = [get_typestore(Stores[f"ROS2_{name}"]) for name in ("HUMBLE", "JAZZY", "LYRICAL")]
+    assert {store.hash_rihs01(kind) for store in stores} == {type_hash(kind)}
 
 
 @UNHURRIED
@@ -202,14 +197,14 @@ def test_random_bytes_raise_nothing_else(payload):
         assert message is None or isinstance(message, Joints | tuple)
 
 
-@pytest.mark.parametrize("count", [MAX_ITEMS, MAX_ITEMS + 1])
-def test_a_list_that_is_too_long_is_refused(count):
-    payload = JointState(Header(Time(0, 0), ""), ["j"] * count, [], [], []).serialize()
-    if count <= MAX_ITEMS:
-        assert len(read_joints(payload).names) == count
-    else:
-        with pytest.raises(MalformedMessage, match="Not a sensor_msgs/msg/JointState"):
-            read_joints(payload)
+def test_a_list_that_is_too_long_is_refused():
+    longest, longer = (
+        JointState(Header(Time(0, 0), ""), ["j"] * count, [], [], []).serialize()
+        for count in (MAX_ITEMS, MAX_ITEMS + 1)
+    )
+    assert len(read_joints(longest).names) == MAX_ITEMS
+    with pytest.raises(MalformedMessage, match="Not a sensor_msgs/msg/JointState"):
+        read_joints(longer)
 
 
 def test_a_few_bytes_may_follow_a_message():
@@ -256,7 +251,6 @@ def test_order_and_other_joints_do_not_matter(q, qd, tau, seed, more):
     [
         (Joints(0.0, ("joint_1",), (1.0,)), "not joint_2"),
         (Joints(0.0, ("joint_1", "joint_2", "joint_1"), (1.0, 2.0, 1.0)), "joint_1 twice"),
-        (Joints(0.0, ("joint_1", "joint_2"), (1.0, math.nan)), "nan for position of joint_2"),
         (Joints(0.0, ("joint_1", "joint_2"), (math.nan, math.nan)), "nan for position of joint_1"),
         (Joints(0.0, ("joint_2", "joint_1"), (1.0, 1.0), (math.nan, 0.0)), "nan for velocity of joint_2"),
         (Joints(0.0, ("joint_1", "joint_2"), (1.0, 1.0), (), (math.inf, 0.0)), "inf for effort of joint_1"),
@@ -284,13 +278,11 @@ def test_a_motor_is_judged_by_its_limits(temp_c, level):
     assert dict(motors[2].values) == {"temperature_c": repr(temp_c), "headroom_k": repr(60.0 - temp_c)}
 
 
-def test_a_fault_is_an_error_of_the_arm():
+def test_a_fault_is_an_error_of_the_arm_and_an_old_state_is_stale():
     assert told(mode="faulted")[0].level == ERROR
-
-
-def test_an_old_state_is_stale():
     assert {status.level for status in told(age_s=3.5, word=WORD)} == {STALE}
     assert {status.level for status in told(age_s=2.5, word=WORD)} == {OK}
+    assert temperatures(told(age_s=3.5), NAMES, "f/arm_0") == {}
 
 
 WORD = DifficultyScores("arm_0", 1, 12.0, "twin-1", ("j", "k", "l"), (0.5, None, 0.25), (0.1, None, None))
@@ -312,10 +304,6 @@ def test_temperatures_survive_a_round_trip(temp_c):
     statuses = read_diagnostics(write_diagnostics(1.0, told(temp_c=temp_c)))
     assert temperatures(statuses, NAMES, "f/arm_0") == dict(zip(NAMES, temp_c, strict=True))
     assert temperatures(statuses, NAMES, "f/arm_1") == {}
-
-
-def test_stale_temperatures_are_ignored():
-    assert temperatures(told(age_s=9.0), NAMES, "f/arm_0") == {}
 
 
 @pytest.mark.parametrize("said", ["warm", "nan", "inf", ""])
@@ -392,12 +380,6 @@ def test_keys_and_tokens_are_those_of_the_design_page():
     assert publisher_token(on_two, "8b20917502ee955ac4476e0266340d5c", "talker", 10, "::,7:,:,:,,") == TALKER_TOKEN
 
 
-def test_a_namespace_is_part_of_key_and_token():
-    topic = Topic("/robot1/arm/joint_states", "sensor_msgs/msg/JointState", "RIHS01_x", domain=7)
-    assert topic.key == "7/robot1/arm/joint_states/sensor_msgs::msg::dds_::JointState_/RIHS01_x"
-    assert "/%robot1%arm%joint_states/" in publisher_token(topic, "z", "n", 1)
-
-
 @examples(50)
 @given(st.integers(-(2**63), 2**63 - 1), st.integers(-(2**63), 2**63 - 1), st.binary(min_size=16, max_size=16))
 def test_an_attachment_is_what_zenoh_itself_would_serialise(number, time_ns, sender):
@@ -409,25 +391,16 @@ def test_an_attachment_is_what_zenoh_itself_would_serialise(number, time_ns, sen
 def test_a_topic_that_ros_does_not_allow_is_refused(name):
     with pytest.raises(BusError, match="is no topic"):
         Topic(name, STRING, NO_HASH)
-
-
-@pytest.mark.parametrize("number", [-1, 233])
-def test_a_domain_that_ros_does_not_allow_is_refused(number):
     with pytest.raises(BusError, match="0 to 232"):
-        Topic("/chatter", STRING, NO_HASH, domain=number)
+        Topic("/chatter", STRING, NO_HASH, domain=233)
 
 
 @examples(50)
 @given(st.text(max_size=20))
-def test_any_name_becomes_part_of_a_topic(name):
+def test_any_name_becomes_part_of_a_topic_and_stays(name):
     part = plain_name(name)
     assert Topic(f"/{part}/joint_states", STRING, NO_HASH).key.startswith(f"0/{part}/joint_states/")
-
-
-@examples(50)
-@given(st.from_regex(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", fullmatch=True))
-def test_a_good_name_stays(name):
-    assert plain_name(name) == name
+    assert plain_name(part) == part
 
 
 def test_a_message_arrives_with_the_attachment_of_rmw_zenoh(domain):
@@ -471,18 +444,6 @@ def test_messages_of_every_ros_version_arrive(domain, type_hash):
         except queue.Empty:
             continue
     pytest.fail("nothing was heard")
-
-
-def test_messages_of_another_domain_do_not_arrive(domain):
-    node, _ = domain
-    listener, talker, heard = node("listener"), node("talker"), queue.SimpleQueue()
-    listener.listen(CHATTER, lambda *said: heard.put(said))
-    watcher = domain[1]()
-    watcher.see(0)
-    watcher.wait_for(node_token(0, str(talker._open().zid()), "talker"), True)
-    for number in (1, 0):  # one line keeps the order
-        talker.publisher(Topic("/chatter", STRING, STRING_HASH, domain=number)).put(str(number).encode())
-    assert heard.get(timeout=PATIENCE_S) == (STRING_HASH, b"0")
 
 
 def test_a_closed_node_raises(domain):

@@ -24,25 +24,16 @@ from fleet.errors import BusError, NoRouter, is_name
 from tests.waiting import PATIENCE_S, PAUSE, serve_until, wait_until
 
 
-def test_the_router_listens_where_it_says():
-    with Router() as router, Router() as other:
-        assert router.endpoint != other.endpoint
-        host, port = router.endpoint.removeprefix("tcp/").split(":")
-        assert host == "127.0.0.1"
-        with socket.create_connection((host, int(port)), timeout=PATIENCE_S):
-            pass
-        open_client(router.endpoint, timeout_s=PATIENCE_S).close()
-
-
-def test_a_port_is_free_again_after_close():
+def test_the_router_listens_where_it_says_until_it_is_closed():
     router = Router().open()
-    port = int(router.endpoint.rsplit(":", 1)[1])
+    port = int(router.endpoint.removeprefix("tcp/127.0.0.1:"))
+    open_client(router.endpoint, timeout_s=PATIENCE_S).close()
     router.close()
     router.close()
     with pytest.raises(BusError, match="not open"):
         _ = router.endpoint
-    with Router(port) as again:
-        assert again.endpoint == f"tcp/127.0.0.1:{port}"
+    with Router(port) as again, Router() as other:
+        assert again.endpoint == f"tcp/127.0.0.1:{port}" != other.endpoint
 
 
 def test_lines_that_nobody_opens_keep_nobody_out():
@@ -72,10 +63,7 @@ def test_loopback_is_allowed(endpoint):
     ("endpoint", "reason"),
     [
         ("tcp/0.0.0.0:7447", "not on loopback"),
-        ("tcp/[::]:7447", "not on loopback"),
-        ("tcp/192.168.1.10:7447", "not on loopback"),
         ("tcp/[::ffff:192.168.1.10]:7447", "not on loopback"),
-        ("tcp/example.org:7447", "may resolve to another machine"),
         ("tcp/localhost.example.org:7447", "may resolve to another machine"),
         ("tcp/127.1:7447", "may resolve to another machine"),
         ("udp/127.0.0.1:7447", "Expected tcp"),
@@ -83,7 +71,6 @@ def test_loopback_is_allowed(endpoint):
         ("tcp/127.0.0.1:99999", "Expected tcp"),
         ("tcp/127.0.0.1:7447#iface=eth0", "Expected tcp"),
         ("tcp/127.0.0.1:7447,tcp/10.0.0.1:7447", "Expected tcp"),
-        ("127.0.0.1:7447", "Expected tcp"),
         ("", "Expected tcp"),
     ],
 )
@@ -107,7 +94,6 @@ def test_with_a_certificate_an_endpoint_may_be_anywhere(endpoint):
         ("tcp/10.0.0.1:7447", None, "Plain TCP does not authenticate"),
         ("tcp/127.0.0.1:7447", TLS, "no endpoint for the certificate of 'arm_0'"),
         ("tls/127.0.0.1:0", TLS, "Expected tls/"),
-        ("quic/127.0.0.1:7447", TLS, "Expected tls/"),
         ("tls/127.0.0.1:7447#enable_mtls=false", TLS, "Expected tls/"),
         ("", TLS, "Expected tls/"),
     ],

@@ -11,10 +11,8 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import ArmEvent, Clock, ClockRequest
-from fleet.bus.router import Router, fleets_at, open_client
+from fleet.bus.router import Router, open_client
 from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import issue, make
 from fleet.bus.security.tls import Tls
@@ -58,18 +56,6 @@ def test_a_certificate_that_is_not_good_is_refused_at_both_ends(open_stranger, g
         return
     with pytest.raises(zenoh.ZError), open_stranger(guarded.endpoint, tls.link(serves=False), timeout_s=SHORT_S):
         pass
-
-
-def test_an_endpoint_that_says_who_connects_is_enough_for_every_command(guarded, folder):
-    endpoint = Tls(folder, "monitor").endpoint(guarded.endpoint)
-    with BusClient(endpoint, "f") as link:
-        link.publish(
-            keys.of_arm("f", "monitor", "event"), ArmEvent("monitor", 0, 0.0, "finish")
-        )  # not its own key: dropped
-        assert not link.query_and_wait(keys.of_clock("f"), ClockRequest(), Clock, timeout_s=PATIENCE_S).messages
-    assert fleets_at(endpoint) == ("f",)
-    with pytest.raises(BusError, match="name it, as tls/"):
-        open_client(guarded.endpoint, timeout_s=PATIENCE_S)
 
 
 def test_nobody_gets_in_without_a_certificate(open_stranger, guarded, folder):

@@ -3,9 +3,8 @@
 from typing import Any
 
 from fleet.bus.protocol.auction import Report
-from fleet.bus.protocol.operator import Action, ControlRequest, Operation
 from fleet.live.journal import Released
-from fleet.live.records import BookRecord, Granted, JobSettled, Requested, outcome_of
+from fleet.live.records import BookRecord, Granted, JobSettled, outcome_of
 
 
 def awarded(award: str, job: str, arm: str = "arm_0", cycles: int = 0, *, place: str = "rack", **more) -> Granted:
@@ -21,7 +20,3 @@ def closed(
         return Released(award, job, arm, outcome, cycles, time_s, reason)
     report = Report(arm, award, job, outcome, cycles, time_s, reason, **more)
     return JobSettled(outcome_of(report, {award: arm} if report.faulted else {}))
-
-
-def requested(action: Action, time_s: float, name: str = "1", awards: tuple[str, ...] = ()) -> Requested:
-    return Requested(Operation("auctioneer", time_s, ControlRequest(name, action, "ann"), awards=awards))

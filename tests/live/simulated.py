@@ -9,15 +9,7 @@ from benchmarks.simulation.simulated_fleet import Fleet
 from benchmarks.simulation.world import Process, World
 from fleet.bus.client import NoReply
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import (
-    Admission,
-    JobSpec,
-    JobStatus,
-    Status,
-    StatusRequest,
-    Submission,
-    SubmissionReply,
-)
+from fleet.bus.protocol.auction import Admission, JobSpec, JobStatus, Status, StatusRequest, Submission, SubmissionReply
 from fleet.bus.protocol.operator import Action, Cleared, ClearRequest, Controlled, ControlRequest
 from fleet.errors import Refused
 from fleet.live.leases import Timing

@@ -5,7 +5,7 @@ from functools import partial
 from itertools import islice
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from agents.auction import Consensus
@@ -16,6 +16,7 @@ from benchmarks.simulation.simulated_fleet import FIRST
 from fleet.bus.protocol.auction import Ack, Award
 from fleet.bus.protocol.keys import of_arm
 from tests.live.simulated import SimulatedFleet, job, refused
+from tests.profiles import examples
 
 ARM_POLICIES = [name for name, rule in RULES.items() if rule.scope == "arm"]
 
@@ -42,6 +43,7 @@ def greedy(difficulty: dict[str, dict[str, float]], able: list[str]) -> dict[str
 
 @example(29830, 2, 1)  # the bid of one arm came later than the other had chosen
 @example(118385827, 2, 2)  # so did that of a faulted arm, by which its peer knows how well each job suits it
+@examples(8)
 @given(st.integers(0, 2**32), st.integers(1, 5), st.integers(1, 4))
 def test_without_message_loss_the_allocation_is_that_of_a_central_policy(seed, arms, jobs):
     """The first job of every arm, where every job has a separate station; some arms are faulted."""
@@ -61,7 +63,7 @@ def test_without_message_loss_the_allocation_is_that_of_a_central_policy(seed, a
 
 
 @pytest.mark.parametrize("name", ARM_POLICIES)
-@settings(max_examples=5)
+@examples(2)
 @given(seed=st.integers(0, 2**32), jobs=st.integers(1, 5))
 def test_every_arm_policy_completes_all_jobs(name, seed, jobs):
     rng = random.Random(seed)
@@ -93,7 +95,7 @@ def offered(arm: str, name: str) -> tuple:
     return SimulatedEstimator(arm, FIRST).plans(job(name))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_claim_covers_the_space_of_the_plan_that_was_chosen(fleet_of, seed):
     """No arm receives the choice of another: the grants alone keep two second plans apart, which exclude each other."""
     fleet = fleet_of(True, choose=second_plan, excludes=both_second, seed=seed)

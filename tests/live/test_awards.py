@@ -5,27 +5,43 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from fleet.bus.protocol.auction import Lease, Receipt
-from fleet.live.arm.awards import (
-    CLOCK_DRIFT,
-    MAX_PAST_AWARDS,
-    ArmHistory,
-    ArmRecord,
-    AwardExecutor,
-    ExecutorConfig,
-    Started,
-)
-from fleet.live.journal import Journal
-from tests.live.award_shop import JOB, LEASE_S, OTHER, VALID_S, award_on, finished, quoted, shop, taken
+from fleet.bus.protocol.auction import Award, JobSpec, Lease, Receipt
+from fleet.live.arm.awards import CLOCK_DRIFT, MAX_PAST_AWARDS, ArmHistory, AwardExecutor, ExecutorConfig
 from tests.live.disk import Disk
 
+JOB = JobSpec(name="j", kind="hold", places=("p",), repetitions=3)
+OTHER = JobSpec(name="k", kind="hold", places=("p",))
+VALID_S, LEASE_S = 5.0, 6.0
 
-def test_an_award_on_a_valid_quote_is_accepted_and_on_disk():
-    executor, disk = shop()
-    award = taken(executor)
-    assert [held.award for held in executor.active] == [award]
-    assert list(ArmHistory().replay(disk.records).active) == [award.award]
-    assert executor.spare_capacity == 0
+
+def shop(disk=None, boot_nonce="n", **config):
+    """An executor at its start, and its disk."""
+    disk = Disk() if disk is None else disk
+    history = ArmHistory().replay(disk.records).after_restart("a", 7.0)
+    disk.records[:] = history.compact()
+    config = ExecutorConfig(**{"valid_s": VALID_S, **config})
+    return AwardExecutor("a", disk.keep, history, nonce=boot_nonce, config=config), disk
+
+
+def award_on(quote, job=JOB, **changes):
+    base = Award(award=f"w-{job.name}", auction="r", auctioneer="x", quote=quote, job=job, lease_s=LEASE_S)
+    return replace(base, **changes)
+
+
+def quoted(executor, *jobs, now_s=0.0, can=True):
+    return executor.add_quote({job.name: (job, can) for job in jobs or (JOB,)}, now_s)
+
+
+def taken(executor, now_s=0.0, **changes):
+    """An award that the arm has taken."""
+    award = award_on(quoted(executor, now_s=now_s), **changes)
+    assert executor.answer_award(award, now_s) == replace(executor.answer_award(award, now_s), accepted=True)
+    return award
+
+
+def finished(executor, award, now_s=1.0):
+    executor.apply_lease(Lease("x", LEASE_S, (award.award,), (), (award.award,)), now_s)
+    executor.finish(33.0, now_s)
 
 
 @pytest.mark.parametrize(
@@ -352,20 +368,3 @@ def test_a_compacted_history_is_the_same_history(cycles, leave, closed):
     assert {n: (h.award, h.cycles, h.may_commit) for n, h in told.active.items()} == {
         n: (h.award, h.cycles, h.may_commit) for n, h in history.active.items()
     }
-
-
-def test_a_journal_on_disk_restores_the_history(tmp_path):
-    with Journal(tmp_path / "a.jsonl", ArmRecord) as journal:
-        history = ArmHistory().replay(journal.records()).after_restart("a", 0.0)
-        journal.rewrite(*history.compact())
-        award = taken(AwardExecutor("a", journal.append, history, nonce="n"))
-    with Journal(tmp_path / "a.jsonl", ArmRecord) as journal:
-        again = ArmHistory().replay(journal.records())
-    assert list(again.active) == [award.award]
-    assert again.boot == 1
-
-
-def test_a_first_start_is_the_first_boot():
-    assert ArmHistory().after_restart("a", 0.0).boot == 1
-    history = ArmHistory().replay([Started(boot=4)]).after_restart("a", 0.0)
-    assert history.compact() == (Started("a", boot=5),)

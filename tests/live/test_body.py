@@ -10,13 +10,15 @@ from hypothesis import strategies as st
 from fleet.engine.batch import Engine, RewardWeights, empty_parts
 from fleet.env.allocation_v2 import Episode, parallel_env
 from fleet.heat.thermal import WINDING, modal_model
-from fleet.live.arm.body import MAX_STEPS, ExpectedTemperatures, SimulatedBody
+from fleet.live.arm.body import ExpectedTemperatures, SimulatedBody
 from fleet.observation import Layout
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED
 
 DT_S = 10.0
 LIMITS = ThermalLimits()
+SOON_HOT = ThermalLimits(warning_c=38.0, error_c=40.0, restart_c=36.0)
+"""A hot job passes them within minutes."""
 
 
 def body_of(arm, *, dt_s=DT_S, limits=LIMITS, ambient_c=lambda time_s: 25.0, warm=False, seed=0, time_s=0.0):
@@ -41,7 +43,7 @@ def started(small, allowed, *, done=0, repetitions=3, payload=None, **options):
 
 
 @pytest.mark.ci_slow
-@settings(max_examples=15, phases=[Phase.generate])
+@settings(max_examples=8, phases=[Phase.generate])
 @given(st.data())
 def test_a_body_passes_the_same_shift_as_the_simulator(small, data):
     """One arm, the same jobs in the same order: temperatures at every tick and every event agree."""
@@ -152,15 +154,6 @@ def test_a_paused_arm_finishes_its_cycle_and_returns_home(small, when, cycles, h
     assert (body.job, body.cycles) == ("a", cycles)
 
 
-def test_a_pause_within_a_cycle_has_no_effect(small):
-    body = started(small, 3, dt_s=0.5)
-    body.advance(9.0)
-    body.allow_cycles(0)
-    body.advance(11.0)
-    body.allow_cycles(3)
-    assert [e.time_s for e in body.advance(60.0) if e.kind == "finish"] == pytest.approx([33.0])
-
-
 def test_nothing_moves_before_cycles_are_allowed(small):
     arm, job, plan = one_job(small, repetitions=1)
     body = body_of(arm)
@@ -192,47 +185,19 @@ def test_release_in_the_last_cycle_finishes_no_job(small):
     assert [e.kind for e in body.advance(60.0)] == ["home"]
 
 
-def test_a_fault_returns_the_job_with_its_cycles_and_the_arm_recovers(small):
+def test_a_faulted_arm_is_not_free_until_a_person_clears_the_fault_of_the_cool_arm(small):
     arm, job, plan = one_job(small, repetitions=5000, payload=small.HOT)
-    limits = ThermalLimits(warning_c=60.0, error_c=75.0, restart_c=50.0)
-    body = body_of(arm, limits=limits)
-    body.start(job, plan, 7)
-    body.allow_cycles(5000)
-    events = [event for hour in range(40) for event in body.advance((hour + 1) * 360.0)]
-    kinds = [e.kind for e in events]
-    assert kinds[:4] == ["torque_warning", "warning", "fault", "return"]
-    fault, returned = events[2], events[3]
-    assert returned.time_s == fault.time_s
-    assert returned.value == 7 + (fault.time_s - 3.0) // 10.0
-    assert kinds[4:] == ["recover", "home"]  # it stood away from home until then
-    assert body.is_free
-    assert body.job == ""
-    peak = body.truth.peak_c[0, 0]
-    assert 75.0 <= peak < 76.0
-
-
-def test_a_faulted_body_is_not_free(small):
-    arm, job, plan = one_job(small, repetitions=5000, payload=small.HOT)
-    body = body_of(arm)
+    body = body_of(arm, limits=SOON_HOT)
     body.start(job, plan, 0)
     body.allow_cycles(5000)
     while body.truth.mode[0, 0] != FAULTED:
         body.advance(body.time_s + DT_S)
-    assert not body.is_free
-    assert body.free_in_s() == np.inf
-    assert body.last_cycle_in_s() == np.inf
-    assert body.read_sensors().mode == "faulted"
+    assert (body.is_free, body.free_in_s(), body.last_cycle_in_s()) == (False, np.inf, np.inf)
     assert set(body.read_sensors().current_a) == {0.0}
     with pytest.raises(ValueError, match="not free and cannot start"):
         body.start(job, plan, 0)
-
-
-def test_a_person_clears_a_fault_once_the_arm_is_cool_and_it_goes_home(small):
-    body = started(small, 5000, repetitions=5000, payload=small.HOT)
-    while body.truth.mode[0, 0] != FAULTED:
-        body.advance(body.time_s + DT_S)
-    assert f"a fault can be cleared below {LIMITS.restart_c:g} °C" in body.clear_fault()
-    while body.truth.temp_c[0, 0, WINDING].max() >= LIMITS.restart_c:
+    assert "a fault can be cleared below 36 °C" in body.clear_fault()
+    while body.truth.temp_c[0, 0, WINDING].max() >= SOON_HOT.restart_c:
         body.advance(body.time_s + DT_S)
     assert body.read_sensors().mode == "faulted", "it waits for a person"
     cool_s = body.time_s
@@ -264,7 +229,8 @@ def test_sensors_read_the_motion(small):
     np.testing.assert_allclose(body.read_sensors().current_a, rest.current_a, rtol=1e-3)
 
 
-def test_its_time_can_be_set_and_it_catches_up_in_bounded_steps(small):
+def test_its_time_can_be_set_and_it_catches_up_in_bounded_steps(small, monkeypatch):
+    monkeypatch.setattr("fleet.live.arm.body.MAX_STEPS", 40)
     arm, job, plan = one_job(small)
     body = body_of(arm, dt_s=1.0)
     body.advance(10.0)
@@ -272,16 +238,14 @@ def test_its_time_can_be_set_and_it_catches_up_in_bounded_steps(small):
     assert body.time_s == pytest.approx(5000.0)
     body.start(job, plan, 0)
     body.allow_cycles(3)
-    assert [e.time_s for e in body.advance(5060.0) if e.kind == "finish"] == pytest.approx([5033.0])
-    body.advance(1e6)
-    assert body.time_s == pytest.approx(5060.0 + MAX_STEPS)
+    assert [e.time_s for e in body.advance(1e6) if e.kind == "finish"] == pytest.approx([5033.0])
+    assert body.time_s == 5040.0
 
 
-@pytest.mark.slow
 def test_a_change_of_step_changes_no_event(small):
     """A faulted arm is moved home and recovers at the same moments, whatever the steps; heat is exact at rest."""
     arm, job, plan = one_job(small, repetitions=5000, payload=small.HOT)
-    bodies = [body_of(arm, dt_s=5.0, limits=ThermalLimits(move_home_s=60.0)) for _ in range(2)]
+    bodies = [body_of(arm, dt_s=5.0, limits=replace(SOON_HOT, move_home_s=60.0)) for _ in range(2)]
     for body in bodies:
         body.start(job, plan, 0)
         body.allow_cycles(5000)
@@ -290,7 +254,7 @@ def test_a_change_of_step_changes_no_event(small):
     steady, changed = bodies
     changed.set_step(2.5)
     assert changed.time_s == pytest.approx(steady.time_s)
-    until_s = steady.time_s + 2 * 3600.0
+    until_s = steady.time_s + 900.0
     events = [[], []]
     for told, body in zip(events, bodies, strict=True):
         while body.time_s < until_s - 1e-6:
@@ -339,7 +303,7 @@ def test_a_body_measures_the_heat_of_its_job_once_the_cycles_have_begun(small):
     assert found[True][-1] is None  # at home
 
 
-@pytest.mark.parametrize(("drift_k_per_s", "time_s"), [(0.0, 0.0), (0.01, 0.0), (-0.01, 0.0), (0.01, 36_000.0)])
+@pytest.mark.parametrize(("drift_k_per_s", "time_s"), [(0.0, 0.0), (-0.01, 0.0), (0.01, 36_000.0)])
 def test_an_arm_finds_by_how_much_its_readings_have_drifted(small, drift_k_per_s, time_s):
     """At home in a steady state, also in an arm that starts late.
 

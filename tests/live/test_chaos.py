@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.chaos.fleet_under_test import JournalFiles
+from benchmarks.chaos.mesh import mesh
 from fleet.bus.protocol.auction import Award, JobSpec, Report
 from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardAccepted, Closed
 from fleet.live.journal import Journal
@@ -96,3 +97,13 @@ def test_a_fleet_survives_every_fault():
     processes = ("kill-arm", "stop-arm", "kill-router", "stuck-subscriber", "full-disk", "partition")
     told = strike(*processes, "malformed", "replayed-awards", jobs=24)
     assert told.returncode == 0, told.stdout + told.stderr
+
+
+@pytest.mark.slow
+def test_two_linked_routers_are_killed_and_cut_without_a_lost_job(tmp_path):
+    arms, jobs = 4, 16
+    outcome = mesh(tmp_path, arms=arms, jobs=jobs, speed=40.0)
+    assert (outcome.lost, outcome.twice, outcome.exited, outcome.violations) == ((), (), (), ())
+    assert outcome.finished + outcome.unfinished == jobs
+    assert outcome.finished >= jobs - arms  # an unfinished job is one that an arm had when it was cut off
+    assert all("inf" not in note for note in outcome.notes)  # all arms were present again after each fault

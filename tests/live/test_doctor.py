@@ -159,12 +159,7 @@ def test_a_fleet_that_needs_no_auctioneer_is_healthy_without_one():
     assert "2 auctioneers" in faults(fleet(arm(), auctioneers=(*ALONE, *ALONE)), auctioneer=False)[0][0]
 
 
-def test_malformed_messages_are_a_fault_with_their_reason():
-    output, _ = faults(fleet(arm()), malformed=3, complaints=("under 'k': not JSON",))
-    assert output == ["3 malformed message(s), the last: under 'k': not JSON"]
-
-
-def test_a_repeated_reason_is_reported_once():
+def test_malformed_messages_are_a_fault_with_each_reason_once():
     output, _ = faults(fleet(arm()), malformed=3, complaints=["no JSON.", "no State.", "no JSON."])
     assert output == ["3 malformed message(s), the last: no JSON.; no State."]
 
@@ -265,8 +260,6 @@ def doctor(endpoint, *options):
 @pytest.mark.ci_slow
 def test_a_healthy_fleet_gives_exit_code_0():
     with Router() as router, participants(router.endpoint):
-        code, output = doctor(router.endpoint)
-        assert (code, "The fleet is healthy." in output) == (0, True), output
         code, output = doctor(router.endpoint, "--json")
     found = json.loads(output)
     assert (code, found["healthy"]) == (0, True)
@@ -287,8 +280,6 @@ def test_an_unhealthy_fleet_gives_exit_code_1_and_all_reasons():
 @pytest.mark.ci_slow
 def test_the_option_no_auctioneer_expects_none():
     with Router() as router, participants(router.endpoint, clocks=0):
-        code, output = doctor(router.endpoint)
-        assert (code, "give --no-auctioneer" in output) == (1, True)
         code, output = doctor(router.endpoint, "--no-auctioneer")
     assert (code, "The fleet is healthy." in output, "time unknown" in output) == (0, True, True), output
 
@@ -296,30 +287,19 @@ def test_the_option_no_auctioneer_expects_none():
 def test_a_router_without_a_fleet_is_not_healthy():
     with Router() as router:
         code, output = doctor(router.endpoint)
-    assert code == 1
-    assert "replies. No fleet found" in output
+    assert (code, "replies. No fleet found" in output) == (1, True), output
 
 
 @pytest.mark.ci_slow
-def test_a_missing_router_gives_exit_code_2_and_the_command_to_start_one():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    code, output = doctor(f"tcp/127.0.0.1:{port}")
-    assert code == 2
-    assert f"thermofleet bus router --port {port}" in output
-
-
-@pytest.mark.ci_slow
-def test_another_server_at_the_port_is_recognised():
+def test_a_missing_router_or_another_server_gives_exit_code_2_and_what_to_do():
     with socket.create_server(("127.0.0.1", 0)) as other:
-        code, output = doctor(f"tcp/127.0.0.1:{other.getsockname()[1]}")
-    assert code == 2
-    assert "no thermofleet router listens on it" in output
+        port = other.getsockname()[1]
+        code, output = doctor(f"tcp/127.0.0.1:{port}")
+    assert (code, "no thermofleet router listens on it" in output) == (2, True), output
+    code, output = doctor(f"tcp/127.0.0.1:{port}")
+    assert (code, f"thermofleet bus router --port {port}" in output) == (2, True), output
 
 
-@pytest.mark.parametrize("wrong", [["--endpoint", "http://x"], ["--seconds", "0"]])
-def test_invalid_options_give_exit_code_2(wrong):
-    code, output = doctor("tcp/127.0.0.1:1", *wrong)
-    assert code == 2
-    assert "Error:" in output
+def test_invalid_options_give_exit_code_2():
+    code, output = doctor("http://x")
+    assert (code, "Error:" in output) == (2, True), output

@@ -211,17 +211,8 @@ def test_the_commands_and_the_example_steer_a_fleet(port, tmp_path):
     assert command("job", "cancel", "one") == (0, "one: cancelled, 0 of 1 cycles.\n")
     assert command("job", "cancel", "one") == (0, "one: cancelled, 0 of 1 cycles. It is cancelled.\n")
     assert command("job", "change", "two", "--due", 900, "--value", 3) == (0, "two: waiting, 0 of 1 cycles.\n")
-    code, said = command("job", "list")
-    assert code == 0
-    assert [line.split()[:2] for line in said.splitlines()[1:]] == [
-        ["one", "cancelled"],
-        ["three", "waiting"],
-        ["two", "waiting"],
-    ]
-    assert [job["job"] for job in json.loads(command("job", "list", "--json")[1])] == ["one", "three", "two"]
     code, said = command("job", "settle", "two", "done")
-    assert code == 2
-    assert "only an unfinished job can be settled" in said
+    assert (code, "only an unfinished job can be settled" in said) == (2, True), said
     code, said = example("cancel", "two")
     assert code == 0
     assert '"state": "cancelled"' in said

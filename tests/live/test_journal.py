@@ -29,8 +29,7 @@ from fleet.live.consensus.participant import Membership
 from fleet.live.journal import CommitPermitted, CompactingJournal, Journal, Started, TimeRecorder
 from fleet.live.records import BookRecord
 from scenarios.live.arm import restart_history
-from tests.live.council.test_council_poison import Arm
-from tests.live.test_poison import Wire
+from tests.live.test_poison import Arm, Wire
 from tests.profiles import examples
 
 ROOT = Path(__file__).parents[2]
@@ -204,7 +203,7 @@ except JournalError as error:
             Journal(path, KIND).open()
         result = subprocess.run(ask, capture_output=True, text=True, check=True, timeout=300, cwd=ROOT)
         assert "in use by another process" in result.stdout
-    assert subprocess.run(ask, capture_output=True, text=True, check=True, timeout=300, cwd=ROOT).stdout == ""
+    Journal(path, KIND).open().close()
 
 
 def test_a_full_disk_leaves_the_journal_unchanged(disk):
@@ -246,17 +245,6 @@ def test_after_a_failed_sync_further_writes_are_refused_until_it_is_reopened(dis
             with pytest.raises(JournalError, match="No further writes until it is reopened"):
                 journal.append(Text("perhaps"))
     assert read(disk.path("j")) in ([Text("kept")], [Text("kept"), Text("perhaps")])
-
-
-def test_a_rewritten_journal_contains_only_the_new_records(tmp_path):
-    path = tmp_path / "j"
-    written(path, *[[Counted(n)] for n in range(50)])
-    with Journal(path, KIND) as journal:
-        journal.rewrite(Counted(49))
-        journal.append(Text("next"))
-        assert list(journal.records()) == [Counted(49), Text("next")]
-    assert read(path) == [Counted(49), Text("next")]
-    assert [each.name for each in tmp_path.iterdir()] == ["j"]
 
 
 @pytest.mark.parametrize("power", [False, True], ids=["killed", "without power"])
@@ -353,7 +341,7 @@ def start(kind: str, name: str, journal) -> None:
             ConsensusNode(arm, Membership(fleet=fleet, choose=lambda *_: {}), journal, boot=1)
 
 
-@pytest.mark.parametrize("starts", [1, 2, 3])
+@pytest.mark.parametrize("starts", [1, 3])
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_journal_of_another_name_is_refused_and_stays_as_it_is(kind, starts, tmp_path):
     path = tmp_path / "arm_2.journal"  # under the name of the other one, as after a swap

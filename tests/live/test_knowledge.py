@@ -3,7 +3,6 @@
 import time
 from collections import Counter
 from dataclasses import replace
-from functools import partial
 from itertools import product
 from random import Random
 from types import SimpleNamespace
@@ -34,6 +33,7 @@ from fleet.live.space import CellSpace
 from fleet.observation import FIELDS, Observation
 from fleet.robot import JOINTS, ThermalLimits
 from scenarios.live.auctioneer import CentralAllocation, job_spec
+from tests.live.test_poison import Wire
 
 MAY_DIFFER = {
     "last_award": "a live fleet counts rounds, and there is a round only when a job can begin",
@@ -80,25 +80,15 @@ class Scores:
         return Difficulty(np.full(JOINTS, 0.1 + 0.05 * plan.work.payload_kg * plan.speed), risk=risk, peak=peak)
 
 
-class Wire:
-    """A client of the bus that keeps what an arm publishes, and its handlers of requests."""
-
-    fleet = "f"
+class KeepingWire(Wire):
+    """Keeps the last message of each kind that an arm publishes."""
 
     def __init__(self) -> None:
-        self.last, self.handlers = {}, {}
+        super().__init__()
+        self.last = {}
 
-    def publisher(self, key: str, kind: type):
-        return partial(self.last.__setitem__, kind)
-
-    def reply_to(self, key: str, kind: type, handle) -> None:
-        self.handlers[kind] = handle
-
-    def declare_token(self, key: str) -> None:
-        pass
-
-    def serve(self, until_s: float) -> None:
-        pass
+    def publisher(self, key, kind):
+        return lambda message: self.last.update({kind: message})
 
 
 class LiveShift:
@@ -116,7 +106,7 @@ class LiveShift:
         ledger = JobBook(arms=NAMES)
         self.auctioneer = Auctioneer("x", ledger, keep=lambda *_: None, boot="1", real_s=0.0, **rules)
         self.auctioneer.submit(Submission(self.jobs), 0.0, 0.0)
-        self.wires = {name: Wire() for name in NAMES}
+        self.wires = {name: KeepingWire() for name in NAMES}
         self.nodes = {name: self.node(arm, world) for name, arm in zip(NAMES, arms, strict=True)}
 
     def node(self, arm, world) -> ArmNode:

@@ -1,6 +1,8 @@
-"""Which jobs are accepted, which are ready, and that a replay of the journal gives the same ledger."""
+"""Which jobs are accepted, ready and given up, and that a replay of the journal gives the same ledger."""
 
 import graphlib
+import sys
+import time
 from collections.abc import Mapping
 
 import msgspec
@@ -8,7 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.bus.protocol.auction import JobSpec, Quote
+from fleet.bus.protocol.auction import MOST_JOBS, JobSpec, Quote, Submission
+from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, decode, encode
+from fleet.bus.protocol.operator import Cancel, ClearRequest, ControlRequest
+from fleet.job import reason_to_give_up
+from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.rounds import Round, closed_space, stated_spaces
 from fleet.live.book import JobBook
 from fleet.live.job_rules import PastJobs, admit
@@ -313,15 +319,14 @@ def test_a_ledger_and_its_snapshot_share_no_objects():
 
 
 def test_the_snapshot_of_a_week_is_short():
-    """300 000 records of time and 3000 awards on 300 jobs: only the jobs remain."""
-    book = ledger(*(spec(f"job {i}", place=f"p{i}") for i in range(300)))
-    for i in range(3000):
-        job = f"job {i % 300}"
+    """Thousands of records of time and hundreds of awards on 30 jobs: only the jobs remain."""
+    book = ledger(*(spec(f"job {i}", place=f"p{i}") for i in range(30)))
+    for i in range(300):
+        job = f"job {i % 30}"
         book.apply(award(job, i))
-        book.apply(closed(f"{i}:{job}", "refused" if i < 2700 else "finished", 4, float(i)))
-        for _ in range(100):
-            book.apply(ClockTick(float(i)))
-    assert sum(len(entry.grants) for entry in book.compact()[0].jobs) == 300
+        book.apply(closed(f"{i}:{job}", "refused" if i < 270 else "finished", 4, float(i)))
+        book.replay([ClockTick(float(i))] * 10)
+    assert sum(len(entry.grants) for entry in book.compact()[0].jobs) == 30
 
 
 def test_settled_jobs_leave_and_their_names_are_known(monkeypatch):
@@ -338,7 +343,7 @@ def test_settled_jobs_leave_and_their_names_are_known(monkeypatch):
     for each in (book, short):
         assert list(each.jobs) == ["job 7", "job 8", "next", "waits"]
         assert each.left == {"finished": 6, "given_up": 1}
-        assert names(each.ready(9.0, 9)) == ["next", "waits"]
+        assert names(each.ready(9.0, 9)) == list(each.waiting) == ["next", "waits"]
         same, other, forgotten = each.admit([spec("job 3", due_s=3.0), spec("job 5", value=2.0), spec("job 2")])
         assert (same.accepted, other.accepted, forgotten.accepted) == (True, False, True)
         assert same.reason == "It was finished long ago, and is not done again; the recording has its result."
@@ -352,9 +357,169 @@ def test_settled_jobs_leave_and_their_names_are_known(monkeypatch):
     assert sum(len(entry.grants) for entry in book.jobs.values()) == 2
 
 
-def test_only_open_jobs_count_against_the_limit(monkeypatch):
-    monkeypatch.setattr("fleet.live.book.MAX_SETTLED", 2)
-    book = ledger(spec("a"), spec("b"), spec("c"))
-    for name in "ab":
-        book.replay([award(name), closed(f"0:{name}", "finished", 4, 1.0)])
-    assert (len(book.jobs), len(book.settled), list(book.waiting)) == (3, 2, ["c"])
+# given up
+
+JOB, NEXT = spec("j"), spec("k", "j")
+LOST = "Given up, because it waits for 'j', which is given up or cancelled."
+attempts = st.lists(st.tuples(st.sampled_from("abcd"), st.sampled_from(["faulted", "returned", "refused", "dropped"])))
+
+
+def too_often(arms: list[str]) -> bool:
+    """The rule, counted in another way: an arm occurs twice, or there are three."""
+    return len(arms) > len(set(arms)) or len(arms) > 2
+
+
+@given(st.lists(st.sampled_from("abcd")))
+def test_two_faults_of_one_arm_or_three_of_all_are_too_many(arms):
+    reason = reason_to_give_up(arms)
+    assert bool(reason) == too_often(arms)
+    assert all(f"'{arm}' {arms.count(arm)} time" in reason for arm in arms) or not reason
+
+
+def end(number: int, arm: str, outcome: str, time_s: float, cycles: int = 0, *, faulted: bool = False) -> BookRecord:
+    return closed(f"{number}:j", outcome, cycles, time_s, "hot", arm=arm, faulted=faulted)
+
+
+@given(attempts)
+def test_the_auctioneer_gives_a_job_up_at_that_fault_and_no_other_event(attempts):
+    """Against a list of faults; a replay of the journal, and of its snapshot, gives the same."""
+    written: list[BookRecord] = [JobsAccepted((JOB, NEXT), "test", 0.0)]
+    book, faults = JobBook().replay(written), list[str]()
+    for number, (arm, ending) in enumerate(attempts, start=1):
+        if too_often(faults):
+            break
+        assert [job.name for job in book.ready(99.0, 9)] == ["j"]
+        outcome = "returned" if ending == "faulted" else ending
+        ended = end(number, arm, outcome, float(number), 1, faulted=ending == "faulted")
+        records = [award("j", number, arm), ended]
+        written += records
+        for record in records:
+            book.apply(record)
+        faults += [arm] if ending == "faulted" else []
+    for ledger in (book, JobBook().replay(written), JobBook().replay(book.compact())):
+        (status,) = ledger.status(["j"])
+        assert status.state == ("given_up" if too_often(faults) else "waiting")
+        if too_often(faults):
+            assert status.reason == reason_to_give_up(faults)
+            assert (status.arm, status.award) == (attempts[len(written) // 2 - 1][0], "")
+            assert not ledger.unsettled()
+            (successor,) = ledger.status(["k"])
+            assert (successor.state, successor.reason) == ("given_up", LOST)
+
+
+def test_faults_of_lost_arms_count_when_they_are_reported_late():
+    book = JobBook().replay([JobsAccepted((JOB,), "test", 0.0)])
+    for number in (1, 2):
+        book.apply(award("j", number, "a"))
+        book.apply(end(number, "a", "dropped", float(number)))
+    book.apply(end(1, "a", "returned", 3.0, faulted=True))
+    assert book.status()[0].state == "waiting"
+    (change,) = book.apply(end(2, "a", "returned", 4.0, faulted=True))
+    assert change.status.state == "given_up"
+    (change,) = book.apply(end(2, "a", "finished", 5.0, 4))
+    assert change.status.state == "finished", "it was done after all"
+
+
+def test_jobs_that_wait_for_a_job_that_is_given_up_are_given_up_until_that_one_is_finished():
+    last = spec("a", "k")  # sorted before the others
+    book = JobBook().replay([JobsAccepted((JOB, NEXT), "test", 0.0)])
+    for number in (1, 2):
+        book.apply(award("j", number, "a"))
+        changes = book.apply(end(number, "a", "returned", float(number), faulted=True))
+    assert [(change.status.job, change.status.state) for change in changes] == [("j", "given_up"), ("k", "given_up")]
+    (admission,) = book.admit((last,))
+    assert (admission.accepted, admission.reason) == (True, LOST.replace("'j'", "'k'"))
+    (change,) = book.apply(JobsAccepted((last,), "test", 3.0))
+    assert (change.status.state, change.status.reason) == ("given_up", admission.reason)
+    for ledger in (book, JobBook().replay(book.compact())):
+        assert not ledger.unsettled()
+        changes = ledger.apply(end(2, "a", "finished", 5.0, 4))
+        assert {change.status.job: change.status.state for change in changes} == {
+            "j": "finished",
+            "k": "waiting",
+            "a": "waiting",
+        }
+        assert [job.name for job in ledger.ready(9.0, 9)] == ["k"]
+
+
+def test_the_work_for_jobs_that_expire_together_grows_with_their_number(monkeypatch):
+    """So does that for the jobs that wait for them."""
+    monkeypatch.setattr("fleet.live.book.MAX_SETTLED", 200)
+
+    def calls(count: int) -> int:
+        late = [JobSpec(f"j{number}", "hold", ("x",), due_s=1.0, expires=True) for number in range(count)]
+        after = [JobSpec(f"after {job.name}", "hold", ("x",), after=(job.name,)) for job in late]
+        book, calls = JobBook().replay([JobsAccepted((*late, *after), "test", 0.0)]), 0
+
+        def count_call(*_: object) -> None:
+            nonlocal calls
+            calls += 1
+
+        sys.setprofile(count_call)
+        try:
+            book.replay(book.expired(2.0))
+        finally:
+            sys.setprofile(None)
+        assert (len(book.jobs), book.unsettled(), book.left["given_up"]) == (200, [], 2 * count - 200)
+        return calls
+
+    assert calls(600) < 3 * calls(300)
+
+
+# requests as large as a message may be
+
+SOON_S = 2.0
+"""Of the processor: far below the 6 s after which an arm loses its lease, and far above what a slow one takes."""
+
+
+@pytest.fixture
+def auctioneer() -> Auctioneer:
+    ledger = JobBook(frozenset({"rack"}), ("arm_0",))
+    return Auctioneer(
+        "auctioneer", ledger, allocate=lambda *_: {}, keep=lambda *_: None, boot="b", real_s=0.0
+    )  # fmt: skip
+
+
+def test_a_cancelled_job_gives_up_a_long_chain_that_waits_for_it_soon(auctioneer):
+    """Each submission names its jobs last first, so that no job comes after the one that it waits for."""
+    auctioneer.submit(Submission((spec("0"),)), 0.0, 0.0)
+    last = 40 * MOST_JOBS
+    for first in range(1, last, MOST_JOBS):
+        chain = tuple(spec(str(i), str(i - 1)) for i in range(first, first + MOST_JOBS))
+        auctioneer.submit(Submission(chain[::-1]), 0.0, 0.0)
+    began_s = time.process_time()
+    auctioneer.control(ControlRequest("r", Cancel("0")), 1.0)
+    assert time.process_time() - began_s < SOON_S
+    assert {status.state for status in auctioneer.status(map(str, range(1, last)))} == {"given_up"}
+    end = auctioneer.status((str(last),))[0]  # the first ones have left the ledger
+    assert end.reason == f"Given up, because it waits for '{last - 1}', which is given up or cancelled."
+
+
+def ring() -> tuple[JobSpec, ...]:
+    names = [f"{i:03}".rjust(128, "é") for i in range(30)]
+    return tuple(spec(name, before) for name, before in zip(names, names[1:] + names[:1], strict=True))
+
+
+def long_names() -> tuple[JobSpec, ...]:
+    return tuple(spec(f"{i:03}".rjust(128, "\U0001f600")) for i in range(100))
+
+
+@pytest.mark.parametrize("jobs", [ring(), long_names()])
+def test_why_jobs_are_not_accepted_fits_into_one_message(auctioneer, jobs):
+    """The router drops what is larger, and who submits would never hear of it."""
+    first = Submission(tuple(msgspec.structs.replace(each, after=()) for each in long_names()))
+    auctioneer.submit(first, 0.0, 0.0)
+    request = Submission(tuple(msgspec.structs.replace(each, dwell_s=7.0) for each in jobs))
+    assert len(encode(request)) <= MOST_BYTES
+    reply = auctioneer.submit(request, 0.0, 0.0)
+    assert len(encode(reply)) <= MOST_BYTES
+    assert not any(each.accepted for each in reply.jobs)
+
+
+@pytest.mark.parametrize("request_", [Submission((spec("j"),)), ClearRequest("arm_0")])
+def test_a_requester_has_a_short_name(request_):
+    """It comes back in every result, which a router would drop if it were larger than the request was."""
+    kind = type(request_)
+    assert decode(kind, encode(msgspec.structs.replace(request_, by="x" * 128))).by == "x" * 128
+    with pytest.raises(MalformedMessage):
+        decode(kind, encode(msgspec.structs.replace(request_, by="x" * 129)))

@@ -1,38 +1,27 @@
 """Every policy live: the same choice from the same observation as in simulation, and a shift that is completed."""
 
 import logging
-from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.policy import EveryArm, Policy, for_all_arms
+from agents.policy import Policy
 from agents.registry import RULES, make_policy
 from fleet.bus.protocol.auction import JobEstimate as Estimate
 from fleet.bus.protocol.auction import JobSpec, PlanQuote, Quote
 from fleet.bus.protocol.messages import State
-from fleet.env.allocation_v2 import parallel_env
 from fleet.errors import BusError
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.rounds import Assignment, Bidding, Choice, offers_of, resolve_claims
-from fleet.observation import FIELDS, LONG_S, Observation
-from fleet.offered_plans import PLANS
+from fleet.observation import LONG_S
 from fleet.robot import ThermalLimits
 from scenarios.live.auctioneer import CentralAllocation
 from tests.live.simulated import job
 from tests.profiles import examples
 
 CENTRAL = [name for name, rule in RULES.items() if rule.scope == "central" and not rule.plans]
-SIMULATED_ONLY = {
-    *("last_award", "station_free", "blocked", "housing_c"),
-    *("job_value", "job_cycles", "job_p"),
-}
-"""Fields that quotes of a working arm do not contain."""
-GIVEN = ("station_free", "blocked")
-"""Of these, those that rules read: taken over as they are."""
 
 
 def quote(arm: str, *offers: Estimate, **changes) -> Quote:
@@ -40,112 +29,14 @@ def quote(arm: str, *offers: Estimate, **changes) -> Quote:
     return Quote(arm=arm, auction="r", quote="q", valid_s=5.0, twin="t", time_s=0.0, estimates=offers, **facts)
 
 
-def plans_of(o: Observation, slot: int) -> Iterator[PlanQuote]:
-    """Return the feasible plans of a slot as an arm quotes them."""
-    for option in range(slot * PLANS, (slot + 1) * PLANS):
-        if o.feasible[option]:
-            yield PlanQuote(
-                plan=option - slot * PLANS,
-                peak_c=float(o.peak_c[option]) or None,
-                p_saturation=float(o.p_saturation[option]),
-                difficulty=float(o.difficulty[option]) if o.known[option] else None,
-                duration_s=float(o.duration_s[option]),
-                finish_in_s=float(o.busy_s + o.duration_s[option]),
-            )
-
-
 def one_plan(job: str, **figures) -> Estimate:
     return Estimate(job, (PlanQuote(**figures),))
-
-
-def quoted(seen: dict[str, Observation], time_s: float) -> Bidding:
-    """Return observations as quotes to an auctioneer; the jobs of a group have one station."""
-    first = next(iter(seen.values()))
-    slots = [slot for slot in range(len(first.offered)) if first.offered[slot]]
-    jobs, quotes, states = [], {}, {}
-    for slot in slots:
-        due_s = float(first.due_in_s[slot]) + time_s
-        jobs.append(
-            JobSpec(
-                name=f"j{slot}",
-                kind="hold",
-                places=(f"p{first.group[slot]:g}",),
-                payload_kg=float(first.payload_kg[slot]),
-                value=float(first.value[slot]),
-                release_s=max(0.0, min(time_s - float(first.age_s[slot]), due_s)),
-                due_s=None if due_s > LONG_S / 2 else due_s,
-                expires=bool(first.expires[slot]),
-            )
-        )
-    for arm, o in seen.items():
-        offers = [Estimate(f"j{slot}", tuple(plans_of(o, slot))) for slot in slots]
-        mode = "idle" if o.idle else "working" if o.working else "faulted"
-        facts = {"mode": mode, "headroom_k": float(o.headroom_k), "capacity": int(bool(o.idle))}
-        quotes[arm] = quote(arm, *offers, **facts)
-        temp_c = tuple(o.temp_c.tolist())
-        states[arm] = State(
-            arm=arm,
-            tick=0,
-            time_s=time_s,
-            mode=mode,
-            temp_c=temp_c,
-            headroom_k=float(o.headroom_k),
-            busy_s=float(o.busy_s),
-            ambient_c=float(o.ambient_c),
-            job_peak_c=float(o.job_peak_c),
-        )
-    return Bidding(
-        auction="r",
-        time_s=time_s,
-        jobs=tuple(jobs),
-        quotes={arm: one for arm, one in quotes.items() if one.capacity},
-        full={arm: one for arm, one in quotes.items() if not one.capacity},
-        states=states,
-        returned={f"j{slot}": (int(first.returns[slot]), time_s - float(first.age_s[slot])) for slot in slots},
-    )
 
 
 def fresh(name: str) -> Policy:
     policy = make_policy(name)
     policy.reset(np.random.default_rng(0))
     return policy
-
-
-@pytest.mark.parametrize("name", [name for name, rule in RULES.items() if not rule.plans])
-def test_the_same_observation_gives_the_same_choice_simulated_and_live(small, name) -> None:
-    """Each step of a shift at which an arm may choose, converted to quotes and back."""
-    env = parallel_env(
-        small.Shifts(arms=3, jobs=16, ticks=80, ambient_c=36.0, plans_per_job=PLANS), ahead_s=np.inf, bids=True
-    )
-    env.reset(seed=4)
-    simulated, live, compared = fresh(name), fresh(name), 0
-    while env.agents:
-        seen = env.knowledge()
-        actions = simulated.act(seen)
-        open_slots = [slot for slot in range(len(seen["arm_0"].offered)) if seen["arm_0"].offered[slot]]
-        if any(o.action_mask[1:-1].any() for o in seen.values()):
-            time_s = float(env.truth.tick[0] * env.world.dt_s)
-            fleet = LiveFleet(arms=tuple(seen), limits=small.Shifts().limits, horizon_s=env.world.horizon_s)
-            live_seen = observe(quoted(seen, time_s), fleet)
-            for arm, o in seen.items():
-                # A quote does not contain busy stations, and no job is given back.
-                mask = np.append(o.action_mask[: len(open_slots) * PLANS + 1], 0)
-                given = {name: getattr(o, name)[: len(open_slots)] for name in GIVEN}
-                live_seen[arm] = replace(live_seen[arm], action_mask=mask, **given)
-                for field in FIELDS:
-                    if field.name not in SIMULATED_ONLY:
-                        expected = getattr(o, field.name)
-                        shown = {"slot": len(open_slots), "option": len(open_slots) * PLANS}
-                        expected = expected[..., : shown[field.axes[-1]]] if shown.keys() & {*field.axes} else expected
-                        np.testing.assert_allclose(
-                            getattr(live_seen[arm], field.name), expected, atol=0.02, err_msg=field.name
-                        )
-            assert live.act(live_seen) == actions
-            compared += 1
-        else:
-            live.act(seen)
-        env.step(actions)
-    assert compared > 5
 
 
 def test_quotes_become_observations() -> None:
@@ -218,7 +109,7 @@ def test_quotes_become_observations() -> None:
 
 
 @pytest.mark.parametrize("name", CENTRAL)
-@examples(25)
+@examples(8)
 @given(seed=st.integers(0, 2**32))
 def test_every_central_policy_awards_jobs_with_a_bid_once(name, seed) -> None:
     rng = np.random.default_rng(seed)
@@ -249,7 +140,7 @@ def test_every_central_policy_awards_jobs_with_a_bid_once(name, seed) -> None:
 @pytest.mark.parametrize("name", CENTRAL)
 def test_every_central_policy_completes_the_jobs_of_an_auctioneer(fleet_of, name) -> None:
     allocate = CentralAllocation(fresh(name), LiveFleet(arms=("arm_0", "arm_1", "arm_2")))
-    fleet, names = fleet_of(alone=False, allocate=allocate), [f"j{i}" for i in range(7)]
+    fleet, names = fleet_of(alone=False, allocate=allocate), [f"j{i}" for i in range(5)]
     fleet.submit(*(job(each, 2, place="xyz"[i % 3]) for i, each in enumerate(names)))
     fleet.until(lambda: fleet.finished == dict.fromkeys(names, 1))
 
@@ -341,9 +232,3 @@ def test_an_illegal_action_is_logged_and_waits(caplog) -> None:
     claims = [claimed_jobs(bidding, seen, {"a": action}) for action in (0, 1, 2, 3, -1)]
     assert claims == [{}, {"a": Choice("j")}, {"a": Choice("j", 1)}, {}, {}]
     assert caplog.text.count("The policy chose the illegal action") == 2
-
-
-def test_a_class_of_scope_arm_runs_for_all_arms_in_simulation_only_by_the_adapter() -> None:
-    for rule in RULES.values():
-        policy = for_all_arms(rule.kind)
-        assert isinstance(policy, EveryArm) == (not hasattr(rule.kind, "act"))

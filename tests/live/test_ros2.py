@@ -24,7 +24,7 @@ from fleet.ros2 import bridge as ros2_bridge
 from fleet.ros2.bridge import FRESH_S, WARM_S, ArmReadings, Bridge, Follower
 from fleet.ros2.conversion import Joints, joint_names
 from fleet.ros2.node import Node
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, wait_until
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 JOINT_STATE, DIAGNOSTICS = "sensor_msgs/msg/JointState", "diagnostic_msgs/msg/DiagnosticArray"
@@ -54,16 +54,21 @@ class Domain:
         for each in states:
             self.fleet.publish(keys.of_arm(self.fleet.fleet, each.arm, "state"), each)
 
+    def serve(self, *states):
+        """The fleet publishes its states, and the bridge works for a moment."""
+        self.say(*states)
+        self.bridge.serve(time.monotonic() + 0.05)
+
     def until(self, condition, *states):
-        """What ROS 2 heard until it holds, while the fleet says its states again and again."""
-        heard, deadline_s = [], time.monotonic() + PATIENCE_S
-        while not (found := [sample for sample in heard if condition(sample)]):
-            assert time.monotonic() < deadline_s, "waited in vain"
-            self.say(*states)
-            self.bridge.serve(time.monotonic() + 0.05)
+        """The first sample in ROS 2 for which it holds, while the fleet publishes its states again and again."""
+        heard = []
+
+        def found():
             while not self.came.empty():
                 heard.append(self.came.get())
-        return found[0]
+            return next(filter(condition, heard), None)
+
+        return wait_until(found, lambda: self.serve(*states))
 
     def tokens(self):
         replies = self.session.liveliness().get("@ros2_lv/0/**", timeout=PATIENCE_S)
@@ -121,10 +126,7 @@ def test_node_and_publishers_are_visible_until_their_arm_leaves(make, monkeypatc
     assert node.endswith("/0/0/NN/%/%/bridge")
     assert [token.split("/")[9] for token in publishers] == ["%diagnostics", "%shop%arm_0%joint_states"]
     monkeypatch.setattr(ros2_bridge, "GONE_S", 0.0)
-    deadline_s = time.monotonic() + PATIENCE_S
-    while len(domain.tokens()) > 2 and time.monotonic() < deadline_s:
-        domain.bridge.serve(time.monotonic() + 0.1)
-    assert len(domain.tokens()) == 2
+    wait_until(lambda: len(domain.tokens()) == 2, domain.serve)
     assert domain.bridge.arms == ()
 
 
@@ -138,10 +140,7 @@ def test_invalid_names_are_changed_and_stay_unique(make):
     one, other = state(arm="arm-0"), state(arm="arm 0", time_s=99.0)
     domain.until(under("0/n7_shops/arm_0/joint_states/"), one)
     domain.until(under(DIAGNOSTICS_KEY), other, one)
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not domain.bridge.skipped and time.monotonic() < deadline_s:
-        domain.say(other)
-        domain.bridge.serve(time.monotonic() + 0.05)
+    wait_until(lambda: domain.bridge.skipped, lambda: domain.serve(other))
     assert domain.bridge.arms == ("arm-0",)
     assert "is that of 'arm-0'" in domain.bridge.skipped["arm 0"]
 
@@ -207,8 +206,10 @@ def test_no_state_is_published_before_all_readings_are_present():
     reality.update_temperatures({name: 30.0 for name in NAMES if name != "joint_4"}, 0.0)
     assert reality.missing(0.0) == "no temperature of joint_4"
     assert state_of(reality) is None
-    reality.update_temperatures({"joint_4": 30.0}, 0.0)
-    assert state_of(reality) is not None
+    reality.update_temperatures({"joint_4": 32.0}, 0.0)
+    state = state_of(reality)
+    assert (state.q, state.qd, state.tau, state.current_a) == (Q, (), (), ())
+    assert (state.temp_c[2:5], state.headroom_k) == ((30.0, 32.0, 30.0), 60.0 - 32.0)
 
 
 def test_old_readings_are_not_published_again():
@@ -218,13 +219,6 @@ def test_old_readings_are_not_published_again():
     late_s = 1.01 * WARM_S
     reality.update_joints(Joints(2.0, NAMES, Q), late_s)
     assert "no temperature of joint_1, joint_2" in reality.missing(late_s)
-
-
-def test_unmeasured_values_are_empty():
-    state = state_of(known())
-    assert (state.q, state.qd, state.tau, state.current_a) == (Q, (), (), ())
-    assert state.temp_c == TEMP_C
-    assert state.headroom_k == 60.0 - 45.5
 
 
 @pytest.mark.parametrize(("speed", "mode"), [(0.0, "idle"), (0.009, "idle"), (0.011, "working"), (-0.5, "working")])
@@ -298,13 +292,18 @@ class Place:
         key = f"3/diagnostics/diagnostic_msgs::msg::dds_::DiagnosticArray_/{type_hash}"
         self.ros.put(key, payload, attachment=ATTACHED)
 
-    def until(self, condition, each=lambda: None):
-        deadline_s = time.monotonic() + PATIENCE_S
-        while not condition():
-            assert time.monotonic() < deadline_s, "waited in vain"
-            each()
+    def live(self):
+        """One reading of everything, as a driver publishes it."""
+        self.play(joint_state())
+        self.warm(diagnostics())
+
+    def until(self, condition, each=None):
+        def turn():
+            (each or self.live)()
             self.follower.serve(time.monotonic() + 0.03)
             self.peer.serve()
+
+        wait_until(condition, turn)
 
 
 @pytest.fixture
@@ -354,12 +353,9 @@ def test_the_states_of_a_real_arm_have_the_scores_of_its_monitor():
         seen = Seen()
         place = Place(stack, seen)
 
-        def live(**more):
-            place.play(joint_state(NAMES, Q, **more))
-            place.warm(diagnostics())
-
         zeros = (0.0,) * 7
-        place.until(lambda: place.states and place.infos, lambda: live(qd=zeros, tau=zeros))
+        still = joint_state(qd=zeros, tau=zeros)
+        place.until(lambda: place.states and place.infos, lambda: (place.play(still), place.warm(diagnostics())))
     assert (place.states[-1].motion_difficulty, place.states[-1].expected_c) == Seen.scores
     assert place.infos == [Info("real", 7, "d:1")]
     time_s, temp_c, q, *_ = (np.concatenate(each) for each in zip(*seen.readings, strict=True))
@@ -379,22 +375,13 @@ def test_the_states_of_a_real_arm_have_the_scores_of_its_monitor():
     ids=["bytes", "nan", "another type", "no number", "type of another message"],
 )
 def test_malformed_messages_are_counted_and_change_nothing(place, rubbish):
-    def live():
-        place.play(joint_state())
-        place.warm(diagnostics())
-        rubbish(place)
-
-    place.until(lambda: place.states and place.link.malformed >= 2, live)
+    place.until(lambda: place.states and place.link.malformed >= 2, lambda: (place.live(), rubbish(place)))
     assert {state.q for state in place.states} == {Q}
     assert {state.temp_c for state in place.states} == {TEMP_C}
 
 
 def test_a_real_arm_takes_no_work_and_gives_the_reason(place):
-    def live():
-        place.play(joint_state())
-        place.warm(diagnostics())
-
-    place.until(lambda: place.states, live)
+    place.until(lambda: place.states)
     job = JobSpec(name="j", kind="hold", places=("rack",))
     got = []
     place.peer.query(
@@ -402,7 +389,7 @@ def test_a_real_arm_takes_no_work_and_gives_the_reason(place):
     )
     award = Award("a.j", "a", "boss", "q", job)
     place.peer.query(keys.of_arm("shop", "real", "award"), award, Ack, got.append, timeout_s=PATIENCE_S)
-    place.until(lambda: len(got) == 2, live)
+    place.until(lambda: len(got) == 2)
     words = [word for answers in got for word in answers.messages.values()]
     (quote,) = (word for word in words if isinstance(word, Quote))
     (ack,) = (word for word in words if isinstance(word, Ack))
@@ -414,15 +401,11 @@ def test_a_real_arm_takes_no_work_and_gives_the_reason(place):
 def test_a_real_arm_uses_fleet_time(place):
     place.peer.reply_to(keys.of_clock("shop"), ClockRequest, lambda _: Clock(time_s=1e6, speed=1.0))
 
-    def live():
-        place.play(joint_state())
-        place.warm(diagnostics())
-
-    place.until(lambda: place.states and place.states[-1].time_s >= 1e6, live)
+    place.until(lambda: place.states and place.states[-1].time_s >= 1e6)
     assert place.states[-1].time_s < 1e6 + PATIENCE_S + 5.0
 
 
 def test_a_real_arm_needs_a_fleet_at_speed_1(place):
     place.peer.reply_to(keys.of_clock("shop"), ClockRequest, lambda _: Clock(time_s=0.0, speed=60.0))
     with pytest.raises(BusError, match="60 times as fast"):
-        place.until(lambda: False, lambda: None)
+        place.until(lambda: False)

@@ -1,6 +1,7 @@
 """The simulated plants against each other, the laws of motion and all pairs of links."""
 
 from dataclasses import replace
+from functools import cache
 from itertools import product
 
 import mujoco
@@ -14,26 +15,122 @@ from fleet.arm.gen3 import gen3_xml
 from fleet.arm.model import ArmModel, build_cell, links_of, set_payload_balls
 from fleet.arm.planner import Planner
 from fleet.arm.plant import STRIDE, TIMESTEP_S, MujocoPlant, control, load_hands, reference, still
-from fleet.arrivals import Arrivals
-from fleet.engine.profile_plant import sample, sample_row
+from fleet.difficulty import Blind
+from fleet.engine.profile_plant import ProfilePlant, recorded_noise, sample, sample_row, telemetry_of
 from fleet.engine.shift import initial, step
 from fleet.engine.tables import drive_of
+from fleet.engine.world import Arm, build_world
 from fleet.errors import FleetError
 from fleet.heat.motor import gen3_motors
-from fleet.job import KINDS, Fixture, Place, Work, payload_radius_m
+from fleet.heat.thermal import gen3_network, thermal_model
+from fleet.job import KINDS, Fixture, Job, Place, Work, payload_radius_m
 from fleet.motion import RATE_HZ, Phase, Plan
 from fleet.offered_plans import PLANS
-from fleet.robot import GEN3, POSTURES, Mount, Robot
+from fleet.robot import GEN3, POSTURES, Mount, Robot, ThermalLimits
 from fleet.telemetry import FAULTED, IDLE, WORKING
-from scenarios.prepare.fleet import make_env
-from scenarios.spec.schema import ArmSpec, JobStream, Planning, Scenario
 
 SAMPLE_S = STRIDE * TIMESTEP_S
+
+# A small cell of two arms, planned once: whatever they do, both plants move them
+
+ROBOTS = (
+    Robot(name="floor"),
+    Robot(name="wall", mount=Mount(position_m=(-0.3, 0.0, 0.7), tilt_deg=(0.0, 90.0, 0.0)), tool_kg=0.5),
+)
+NEAR = Place(name="near", position_m=(0.45, 0.15, 0.25))
+FAR = Place(name="far", position_m=(0.40, -0.30, 0.30))
+FACE = Place(name="face", position_m=(0.55, 0.0, 0.45), tool_deg=(0.0, 90.0, 0.0))
+WORKS = {
+    "pick_place": Work(kind="pick_place", places=(NEAR, FAR), payload_kg=2.0),
+    "sort": Work(kind="sort", places=(NEAR, FAR), payload_kg=0.2, dwell_s=0.2),
+    "hold": Work(kind="hold", places=(FACE,), payload_kg=3.0, dwell_s=20.0),
+    "press": Work(kind="press", places=(NEAR,), force_n=40.0, payload_kg=0.5, dwell_s=4.0),
+}
+HOT = ThermalLimits(error_c=26.0, warning_c=25.8, restart_c=25.6, clear_s=5.0)
+"""A working arm passes this from 25 °C within a minute, and is back soon."""
+
+
+@cache
+def plans_of_arms():
+    """What each arm would do for each work."""
+    planners = [Planner(robot, elbows=1, speeds=(1.0,)) for robot in ROBOTS]
+    return [{work: planner.plan(work) for work in WORKS.values()} for planner in planners]
+
+
+def shift(*jobs, ticks=6, dt_s=10.0, limits=None, robots=ROBOTS, shifts=1):
+    """World of a small cell at 25 °C, and its two plants by name."""
+    arms = [
+        Arm(
+            robot=robot,
+            motors=gen3_motors(),
+            thermal=thermal_model(gen3_network()),
+            rest_tau=ArmModel(robot).gravity_torque(robot.home_q()),
+            model=Blind(),
+            plans=plans_of_arms()[ROBOTS.index(robot)],
+        )
+        for robot in robots
+    ]
+    world = build_world(
+        arms,
+        [jobs] * shifts,
+        limits=limits or ThermalLimits(),
+        dt_s=dt_s,
+        ticks=ticks,
+        slots=8,
+        ambient_c=np.full((ticks, len(arms)), 25.0),
+        start_warm=False,
+    )
+    plans = world.plans
+    rest_tau = np.stack([arm.rest_tau for arm in arms])
+    home = np.stack([robot.home_q() for robot in robots])
+    simulated = MujocoPlant(robots, plans, rest_tau)
+    # The arms of this cell pass through each other, so that both can do all works at any time.
+    simulated.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    return world, {"profile": ProfilePlant(plans, home, rest_tau), "mujoco": simulated}
+
+
+def job(kind, name=None, repetitions=10, after=()):
+    return Job(
+        name=name or kind, work=WORKS[kind], repetitions=repetitions, release_s=0.0, due_s=9e3, value=1.0, after=after
+    )
+
+
+def work_through(world, plant, first=(1, 0), watch=None):
+    """States after each tick; free arms then take turns at the first job on offer."""
+    state, states = initial(world), []
+    for tick in range(world.ticks):
+        actions = np.array([first]) if tick == 0 else (np.arange(len(world.arms)) == tick % len(world.arms))[None]
+        done = step(world, state, actions.astype(int), plant)
+        if watch is not None:
+            watch(done)
+        state = done.state
+        states.append(state)
+    return states
+
+
+def read_sensors(world, plant, done, offsets_s):
+    """Readings of a step, `Telemetry` [sample, arm, ...]."""
+    record = done.record
+    noise = recorded_noise(0, record, offsets_s, world.dt_s, len(world.arms))
+    return telemetry_of(world, record, offsets_s, plant.motion(world, record, offsets_s), noise)
+
+
+def recorded(world, plant, offsets_s, **options):
+    """Readings of a shift, one `Telemetry` per tick, and its steps."""
+    parts, steps = [], []
+
+    def watch(done):
+        parts.append(read_sensors(world, plant, done, offsets_s))
+        steps.append(done)
+
+    work_through(world, plant, watch=watch, **options)
+    return parts, steps
+
 
 # The scene
 
 
-@settings(max_examples=20)
+@settings(max_examples=8)
 @given(payload_kg=st.floats(0.01, 6.0), seed=st.integers(0, 2**31))
 def test_a_loaded_hand_is_a_model_compiled_with_the_load(payload_kg, seed):
     spec = mujoco.MjSpec.from_string(gen3_xml().decode())
@@ -56,10 +153,10 @@ def test_a_loaded_hand_is_a_model_compiled_with_the_load(payload_kg, seed):
             np.testing.assert_allclose(getattr(loaded, name), value, rtol=1e-9, atol=1e-12, err_msg=name)
 
 
-def test_a_load_taken_off_leaves_no_trace(cell):
-    model = build_cell(cell.robots)
+def test_a_load_taken_off_leaves_no_trace():
+    model = build_cell(ROBOTS)
     before = {name: np.copy(getattr(model, name)) for name in ("body_subtreemass", "dof_invweight0", "dof_M0")}
-    bodies = np.array([model.body(f"{robot.name}/payload").id for robot in cell.robots])
+    bodies = np.array([model.body(f"{robot.name}/payload").id for robot in ROBOTS])
     for payload_kg in ((2.0, 0.5), (0.0, 0.0)):
         load_hands(model, mujoco.MjData(model), bodies, np.array(payload_kg))
     for name, value in before.items():
@@ -69,20 +166,19 @@ def test_a_load_taken_off_leaves_no_trace(cell):
 # Motion in the scene
 
 
-@pytest.mark.parametrize("arm", [0, 1])
-@pytest.mark.parametrize("kind", KINDS)
-def test_arms_follow_their_plan_and_need_its_torque(cell, kind, arm):
+@pytest.mark.parametrize(("kind", "arm"), [("pick_place", 0), ("sort", 1), ("hold", 1), ("press", 0)])
+def test_arms_follow_their_plan_and_need_its_torque(kind, arm):
     """Tracking in joint space; the torque of the plan is inverse dynamics of the arm alone, with Jᵀf of a press."""
     repetitions = 2
-    world, plants = cell.shift(cell.job(kind, repetitions=repetitions))
-    plan = cell.plans[arm][cell.works[kind]][0]
+    world, plants = shift(job(kind, repetitions=repetitions))
+    plan = plans_of_arms()[arm][WORKS[kind]][0]
     offsets = np.arange(1, 501) / RATE_HZ
-    parts, _ = cell.recorded(world, plants["mujoco"], offsets, first=(1, 0) if arm == 0 else (0, 1))
+    parts, _ = recorded(world, plants["mujoco"], offsets, first=(1, 0) if arm == 0 else (0, 1))
     count = round(plan.duration_s(repetitions) * RATE_HZ) - 1
     motion = np.stack([np.concatenate([getattr(p, n)[:, arm] for p in parts]) for n in ("q", "qd", "tau")], axis=1)
     planned = sample(plan, np.arange(1, count + 1) / RATE_HZ, repetitions)
     error = motion[:count] - planned
-    told, _ = cell.recorded(world, plants["profile"], offsets, first=(1, 0) if arm == 0 else (0, 1))
+    told, _ = recorded(world, plants["profile"], offsets, first=(1, 0) if arm == 0 else (0, 1))
     np.testing.assert_array_equal(np.concatenate([p.q[:, arm] for p in told])[:count], planned[:, 0])
     np.testing.assert_array_equal(np.concatenate([p.tau[:, arm] for p in told])[:count], planned[:, 2])
     rms = np.sqrt((error**2).mean(axis=0))
@@ -92,43 +188,41 @@ def test_arms_follow_their_plan_and_need_its_torque(cell, kind, arm):
     steady = np.abs(np.diff(planned[:, 2], axis=0, prepend=planned[:1, 2])).max(axis=1) < 2.0
     assert np.mean(steady) > 0.9
     assert np.sqrt((error[steady, 2] ** 2).mean(axis=0)).max() < 0.2
-    np.testing.assert_allclose(
-        motion[count + 1 :, 0], np.tile(cell.robots[arm].home_q(), (3000 - count - 1, 1)), atol=1e-3
-    )
+    np.testing.assert_allclose(motion[count + 1 :, 0], np.tile(ROBOTS[arm].home_q(), (3000 - count - 1, 1)), atol=1e-3)
 
 
-def heavy_plan(cell, payload_kg):
+def heavy_plan(payload_kg):
     """A made-up hold at home whose payload the plan's torque knows nothing of."""
-    robot = cell.robots[0]
+    robot = ROBOTS[0]
     q, tau = robot.home_q(), ArmModel(robot).gravity_torque(robot.home_q())
     profile = np.broadcast_to(np.stack([q, np.zeros(7), tau]), (100, 3, 7)).astype(np.float32)
     none = Phase(np.zeros((0, 3, 7), np.float32), np.zeros(0, np.float32))
     cycle = Phase(profile, np.full(100, payload_kg, np.float32))
-    return Plan(robot.name, cell.works["hold"], 0, 1.0, none, cycle, none)
+    return Plan(robot.name, WORKS["hold"], 0, 1.0, none, cycle, none)
 
 
 @pytest.mark.parametrize("clips", [False, True])
-def test_torque_is_what_changes_the_momentum(cell, clips):
+def test_torque_is_what_changes_the_momentum(clips):
     """Second method: a plain loop of `mj_step`, and M (v⁺ − v)/h + c − Jᵀf from its states."""
-    plan = heavy_plan(cell, 60.0) if clips else cell.plans[0][cell.works["press"]][0]
-    world, _ = cell.shift(cell.job("press"), robots=cell.robots[:1], dt_s=2.0)
-    rest_tau = ArmModel(cell.robots[0]).gravity_torque(cell.robots[0].home_q())
-    plant = MujocoPlant(cell.robots[:1], [plan], rest_tau[None])
+    plan = heavy_plan(60.0) if clips else plans_of_arms()[0][WORKS["press"]][0]
+    world, _ = shift(job("press"), robots=ROBOTS[:1], dt_s=2.0)
+    rest_tau = ArmModel(ROBOTS[0]).gravity_torque(ROBOTS[0].home_q())
+    plant = MujocoPlant(ROBOTS[:1], [plan], rest_tau[None])
     state = initial(world)
     state.mode[:], state.job[:], state.plan[:], state.todo[:] = WORKING, 0, 0, 5
     states = [state]
     for _ in range(2):  # The second tick is looked at: the press begins in it.
         done = step(world, states[-1], np.zeros((1, 1), int), plant)
-        read = cell.read(world, plant, done, np.arange(1, 201) * SAMPLE_S)
+        read = read_sensors(world, plant, done, np.arange(1, 201) * SAMPLE_S)
         states.append(done.state)
-    model = build_cell(cell.robots[:1])
+    model = build_cell(ROBOTS[:1])
     data, scratch = mujoco.MjData(model), mujoco.MjData(model)
     kp, kv = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
     body = np.array([model.body("floor/payload").id])
-    data.qpos[:] = cell.robots[0].home_q()
+    data.qpos[:] = ROBOTS[0].home_q()
     tau, q, inertia, jacobian = [], [], np.empty((7, 7)), np.empty((3, 7))
     for tick in range(2):
-        home = still(cell.robots[0].home_q(), rest_tau, 100)
+        home = still(ROBOTS[0].home_q(), rest_tau, 100)
         told = reference(plan, 5, 2.0 * tick, 100, home)
         for i, ctrl in enumerate(control([told], 10, kp, kv)):
             set_payload_balls(model, body, told.payload_kg[[i // 10]])
@@ -171,60 +265,39 @@ def test_torque_goes_straight_but_jumps_with_the_load():
 # Faults and readings
 
 
-def test_only_faulted_arms_heat_nothing(cell):
-    world, plants = cell.shift(cell.job("hold", repetitions=20), ticks=40, limits=cell.HOT)
-    drives = []
-    plant = plants["mujoco"]
-    inner = plant.drive
-
-    def spy(world, state):
-        drives.append((state.mode[0].copy(), inner(world, state)))
-        return drives[-1][1]
-
-    plant.drive = spy
-    cell.work_through(world, plant)
-    modes = np.array([mode for mode, _ in drives])
-    heats = np.array([drive.current_sq[0].any(axis=-1) for _, drive in drives])
-    rubs = np.array([drive.friction_w[0].any(axis=-1) for _, drive in drives])
-    assert (modes == FAULTED).any()
-    np.testing.assert_array_equal(heats, modes != FAULTED)
-    assert not rubs[modes == FAULTED].any()
+def test_only_faulted_arms_heat_nothing():
+    world, plants = shift(job("hold"), ticks=1)
+    state = initial(world)
+    state.mode[:] = FAULTED, IDLE
+    drive = plants["mujoco"].drive(world, state)
+    assert drive.current_sq[0].any(axis=-1).tolist() == [False, True]
+    assert not drive.friction_w[0, 0].any()
 
 
-@pytest.mark.ci_slow
-def test_looking_at_the_sensors_changes_nothing(cell):
-    seen, unseen = [], []
-    for states, watched in ((seen, True), (unseen, False)):
-        world, plants = cell.shift(cell.job("hold", repetitions=20), ticks=40, limits=cell.HOT)
-        plant = plants["mujoco"]
+def test_tick_zero_starts_afresh_and_looking_at_the_sensors_changes_nothing():
+    world, plants = shift(job("sort", repetitions=90), job("hold"), ticks=3)
+    plant, ends = plants["mujoco"], []
 
-        def watch(done, world=world, plant=plant):
-            cell.read(world, plant, done, np.array([5.0]))
+    def look(done):
+        read_sensors(world, plant, done, np.array([5.0]))
 
-        states += cell.work_through(world, plant, watch=watch if watched else None)
-        states.append(plant.data.qpos.copy())
-    np.testing.assert_array_equal(seen[-1], unseen[-1])
-    np.testing.assert_array_equal(seen[-2].temp_c, unseen[-2].temp_c)
-
-
-def test_tick_zero_starts_afresh(cell):
-    world, plants = cell.shift(cell.job("sort", repetitions=90), cell.job("hold"), ticks=4)
-    first, second = (cell.work_through(world, plants["mujoco"])[-1].temp_c for _ in range(2))
-    np.testing.assert_array_equal(first, second)
+    for watch in (None, look):
+        states = work_through(world, plant, watch=watch)
+        ends.append((plant.data.qpos.copy(), states[-1].temp_c))
+    np.testing.assert_equal(*ends)
 
 
 # Errors
 
 
-def test_many_envs_and_parts_of_samples_are_refused_and_ticks_come_in_order(cell):
-    for changes, nobody, said in (
-        ({"shifts": 2}, np.zeros((2, 2), int), r"simulates one env \(got 2\)"),
-        ({"dt_s": 1.01}, np.zeros((1, 2), int), r"whole 0.02 s \(got 1.01 s\)"),
+def test_many_envs_and_parts_of_samples_are_refused_and_ticks_come_in_order():
+    for (world, plants), nobody, said in (
+        (shift(job("sort"), shifts=2), np.zeros((2, 2), int), r"simulates one env \(got 2\)"),
+        (shift(job("sort"), dt_s=1.01), np.zeros((1, 2), int), r"whole 0.02 s \(got 1.01 s\)"),
     ):
-        world, plants = cell.shift(cell.job("sort"), **changes)
         with pytest.raises(ValueError, match=said):
             step(world, initial(world), nobody, plants["mujoco"])
-    world, plants = cell.shift(cell.job("sort"))
+    world, plants = shift(job("sort"))
     done = step(world, initial(world), np.zeros((1, 2), int), plants["mujoco"])
     later = done.state.changed(tick=done.state.tick + 1)
     with pytest.raises(ValueError, match=r"1 is next \(got 2\)"):
@@ -234,21 +307,20 @@ def test_many_envs_and_parts_of_samples_are_refused_and_ticks_come_in_order(cell
         plants["mujoco"].motion(world, done.record, np.array([1.0]))
 
 
-def test_a_simulation_that_diverges_is_an_error(cell, tmp_path, monkeypatch):
+def test_a_simulation_that_diverges_is_an_error(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning into a file.
-    plan = cell.plans[0][cell.works["press"]][0]
-    world, _ = cell.shift(cell.job("press"), robots=cell.robots[:1])
+    plan = plans_of_arms()[0][WORKS["press"]][0]
+    world, _ = shift(job("press"), robots=ROBOTS[:1])
     work = replace(plan.work)
     object.__setattr__(work, "force_n", 1e12)  # beyond the bounds of a work
-    plant = MujocoPlant(cell.robots[:1], [replace(plan, work=work)], np.zeros((1, 7)))
+    plant = MujocoPlant(ROBOTS[:1], [replace(plan, work=work)], np.zeros((1, 7)))
     with pytest.raises(FleetError, match="diverged in tick 0"):
         step(world, initial(world), np.ones((1, 1), int), plant)
 
 
-@pytest.mark.parametrize("timestep_s", [0.003, 0.02, 0.005])
-def test_a_timestep_must_fit_into_a_sample(cell, timestep_s):
+def test_a_timestep_must_fit_into_a_sample():
     with pytest.raises(ValueError, match="must be 4, 2, 1"):
-        MujocoPlant(cell.robots, [], np.zeros((2, 7)), timestep_s=timestep_s)
+        MujocoPlant(ROBOTS, [], np.zeros((2, 7)), timestep_s=0.003)
 
 
 ONE = Robot(name="one")
@@ -358,9 +430,9 @@ def test_a_payload_in_a_table_is_reported_while_it_is_carried():
 # In the plant
 
 
-def driven(cell, robots, *, contacts):
+def driven(robots, *, contacts):
     """Postures and events of ten seconds in which both arms of the small cell work, their mounts moved to `robots`."""
-    world, plants = cell.shift(cell.job("sort"), cell.job("hold"), ticks=2)
+    world, plants = shift(job("sort"), job("hold"), ticks=2)
     plant = MujocoPlant(robots, plants["mujoco"]._plans, plants["mujoco"]._home_tau)
     if not contacts:
         plant.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
@@ -373,19 +445,19 @@ def driven(cell, robots, *, contacts):
     return np.concatenate(motion), events
 
 
-def test_arms_apart_move_bit_for_bit_as_without_contacts(cell):
-    robots = [cell.robots[0], Robot(name="wall", mount=Mount(position_m=(-2.0, 0.0, 0.7), tilt_deg=(0.0, 90.0, 0.0)))]
-    with_contacts, events = driven(cell, robots, contacts=True)
-    without, _ = driven(cell, robots, contacts=False)
+def test_arms_apart_move_bit_for_bit_as_without_contacts():
+    robots = [ROBOTS[0], Robot(name="wall", mount=Mount(position_m=(-2.0, 0.0, 0.7), tilt_deg=(0.0, 90.0, 0.0)))]
+    with_contacts, events = driven(robots, contacts=True)
+    without, _ = driven(robots, contacts=False)
     assert events == []
     assert np.abs(np.diff(with_contacts[:, :, 0], axis=0)).max(axis=(0, 2)).min() > 0.001  # both move
     np.testing.assert_array_equal(with_contacts, without)
 
 
-def test_crossing_arms_push_one_another_and_are_reported(cell):
-    robots = [cell.robots[0], Robot(name="wall", mount=Mount(position_m=(-0.75, 0.0, 0.7), tilt_deg=(0.0, 90.0, 0.0)))]
-    motion, events = driven(cell, robots, contacts=True)
-    free, unpushed = driven(cell, robots, contacts=False)
+def test_crossing_arms_push_one_another_and_are_reported():
+    robots = [ROBOTS[0], Robot(name="wall", mount=Mount(position_m=(-0.75, 0.0, 0.7), tilt_deg=(0.0, 90.0, 0.0)))]
+    motion, events = driven(robots, contacts=True)
+    free, unpushed = driven(robots, contacts=False)
     assert events
     first = events[0].time_s
     before = round(first / SAMPLE_S) - 1
@@ -403,15 +475,15 @@ def test_crossing_arms_push_one_another_and_are_reported(cell):
 
 
 @given(kind=st.sampled_from(KINDS), arm=st.integers(0, 1), cycle=st.integers(0, 4), more=st.integers(1, 5))
-def test_every_cycle_is_the_cycle(cell, kind, arm, cycle, more):
-    plan = cell.plans[arm][cell.works[kind]][0]
+def test_every_cycle_is_the_cycle(kind, arm, cycle, more):
+    plan = plans_of_arms()[arm][WORKS[kind]][0]
     samples = np.arange(len(plan.cycle.profile))
     time_s = plan.approach.duration_s + cycle * plan.cycle.duration_s + samples / RATE_HZ
     np.testing.assert_array_equal(sample(plan, time_s, cycle + more), plan.cycle.profile)
 
 
-def test_rows_of_a_job_are_approach_cycles_and_retreat(cell):
-    plan = cell.plans[0][cell.works["sort"]][0]
+def test_rows_of_a_job_are_approach_cycles_and_retreat():
+    plan = plans_of_arms()[0][WORKS["sort"]][0]
     a, c, r = (len(phase.profile) for phase in plan.phases)
     rows = sample_row(np.array([a, c, r]), np.arange(a + 2 * c + r + 5) / RATE_HZ, 2)
     expected = [*range(a + c), *range(a, a + c), *range(a + c, a + c + r)]
@@ -420,14 +492,14 @@ def test_rows_of_a_job_are_approach_cycles_and_retreat(cell):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_heat_of_a_job_adds_up_to_that_of_its_motion(cell, kind):
+def test_heat_of_a_job_adds_up_to_that_of_its_motion(kind):
     """Heat of all steps, taken back through the motor law, against the motion sampled from end to end."""
     repetitions = 3
-    world, plants = cell.shift(cell.job(kind, repetitions=repetitions), ticks=10)
+    world, plants = shift(job(kind, repetitions=repetitions), ticks=10)
     steps = []
-    states = cell.work_through(world, plants["profile"], watch=steps.append)
+    states = work_through(world, plants["profile"], watch=steps.append)
     assert states[-1].mode[0, 0] == IDLE
-    plan = cell.plans[0][cell.works[kind]][0]
+    plan = plans_of_arms()[0][WORKS[kind]][0]
     length_s = plan.duration_s(repetitions)
     whole = sample(plan, np.arange(round(length_s * RATE_HZ)) / RATE_HZ, repetitions).astype(float)
     motors = gen3_motors()
@@ -451,20 +523,16 @@ def test_heat_of_a_job_adds_up_to_that_of_its_motion(cell, kind):
 # Both plants
 
 
-def mixed_jobs(cell):
-    """Long enough for twenty minutes of two arms."""
-    return (
-        cell.job("hold", repetitions=50),
-        cell.job("pick_place", repetitions=60),
-        cell.job("press", repetitions=60, after=("pick_place",)),
-        cell.job("sort", repetitions=200, after=("press",)),
-    )
-
-
 @pytest.mark.ci_slow
-def test_motor_temperatures_of_both_plants_agree_after_twenty_minutes(cell):
-    world, plants = cell.shift(*mixed_jobs(cell), ticks=120)
-    profile, simulated = (cell.work_through(world, plant, first=(2, 1)) for plant in plants.values())
+def test_motor_temperatures_of_both_plants_agree_after_twenty_minutes():
+    jobs = (
+        job("hold", repetitions=50),
+        job("pick_place", repetitions=60),
+        job("press", repetitions=60, after=("pick_place",)),
+        job("sort", repetitions=200, after=("press",)),
+    )
+    world, plants = shift(*jobs, ticks=120)
+    profile, simulated = (work_through(world, plant, first=(2, 1)) for plant in plants.values())
     assert (profile[-1].status[0, :3] == 2).all()
     assert profile[-1].peak_c.max() > 40.0
     for one, other in zip(profile, simulated, strict=True):
@@ -474,12 +542,11 @@ def test_motor_temperatures_of_both_plants_agree_after_twenty_minutes(cell):
 
 
 @pytest.mark.ci_slow
-@pytest.mark.parametrize("kind", ["hold", "pick_place"])
-@pytest.mark.parametrize("name", ["profile", "mujoco"])
-def test_a_fault_cuts_the_tick_and_the_brakes_hold_until_the_arm_goes_home(cell, name, kind):
-    world, plants = cell.shift(cell.job(kind, repetitions=60), ticks=90, limits=cell.HOT)
+@pytest.mark.parametrize(("name", "kind"), [("profile", "hold"), ("mujoco", "pick_place")])
+def test_a_fault_cuts_the_tick_and_the_brakes_hold_until_the_arm_goes_home(name, kind):
+    world, plants = shift(job(kind, repetitions=60), ticks=90, limits=HOT)
     offsets = np.arange(1, 501) / RATE_HZ
-    parts, steps = cell.recorded(world, plants[name], offsets)
+    parts, steps = recorded(world, plants[name], offsets)
     cuts = [i for i, done in enumerate(steps) if done.record.cut_s[0, 0] < world.dt_s]
     assert len(cuts) >= 2
     for cut in cuts[:-1]:
@@ -496,36 +563,9 @@ def test_a_fault_cuts_the_tick_and_the_brakes_hold_until_the_arm_goes_home(cell,
             for quiet in (part.qd, part.tau, part.current_a):
                 assert np.all(quiet[rows, 0] == 0.0)
             np.testing.assert_allclose(part.q[rows, 0], np.tile(stood[0], (len(part.q[rows]), 1)), atol=1e-5)
-        assert np.linalg.norm(stood[0] - cell.robots[0].home_q()) > 0.1
+        assert np.linalg.norm(stood[0] - ROBOTS[0].home_q()) > 0.1
         # It goes on from there, along its path.
         np.testing.assert_allclose(parts[recovered + 1].q[0, 0], stood[0], atol=2.8 / RATE_HZ)
     path = np.concatenate([part.q[:, 0] for part in parts])
     assert np.abs(np.diff(path, axis=0)).max() < 1.4 / RATE_HZ
-    np.testing.assert_allclose(path[0], cell.robots[0].home_q(), atol=0.05)
-
-
-def test_a_scenario_chooses_its_plant(cell, tmp_path):
-    scenario = Scenario(
-        name="two",
-        description="",
-        horizon_s=60.0,
-        arms=(ArmSpec(name="one"),),
-        places=cell.places,
-        jobs=(
-            JobStream(
-                name="sort", kind="sort", places=("near", "far"), arrivals=Arrivals(kind="trace", times_s=(0.0,))
-            ),
-        ),
-        planning=Planning(elbows=1, speeds=(1.0,)),
-    )
-    peaks = {}
-    for name in ("profile", "mujoco"):
-        env = make_env(scenario, difficulty="blind", plant=name, cache=tmp_path)
-        env.reset(seed=0)
-        while env.agents:
-            env.step(dict.fromkeys(env.agents, 1))
-        assert isinstance(env.episode.plant, MujocoPlant) == (name == "mujoco")
-        assert (env.truth.status == 2).all()
-        peaks[name] = env.truth.temp_c
-        env.close()
-    np.testing.assert_allclose(peaks["profile"], peaks["mujoco"], atol=0.1)
+    np.testing.assert_allclose(path[0], ROBOTS[0].home_q(), atol=0.05)

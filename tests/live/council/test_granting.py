@@ -4,6 +4,8 @@ import re
 from contextlib import nullcontext
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from fleet.bus.protocol.auction import Award, JobSpec
 from fleet.bus.protocol.consensus import (
@@ -16,11 +18,12 @@ from fleet.bus.protocol.consensus import (
     JobOutcome,
 )
 from fleet.errors import BusError, Refused
+from fleet.job import reason_to_give_up
 from fleet.live.arm.awards import ArmHistory, AwardExecutor
 from fleet.live.book import JobBook
 from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Claimant, Granter
 from fleet.live.epochs import check_journals
-from fleet.live.leases import Timing
+from fleet.live.leases import Timing, expire
 from fleet.live.records import Granted
 from tests.live.disk import Disk
 
@@ -154,6 +157,61 @@ def test_a_compacted_book_has_fewer_records(granter, disk):
     records = granter.book.compact()
     assert len(records) < len(disk.records)
     assert JobBook(is_central=False).replay(records).compact() == records
+
+
+def attempt(granter: Granter, arm: str, number: int, faults: dict[str, str]) -> str:
+    """An arm gets the job, faults, and names all faults that it knows then; return the state of the job."""
+    award = f"{arm}-{number}"
+    assert granted(granter.answer_claim(claim(arm, 2 * number, entry(award)), 0.0)) == [award]
+    returned = JobOutcome("j", award, arm, "returned", 0, 1.0, "hot", faults | {award: arm})
+    granter.answer_claim(claim(arm, 2 * number + 1, settled=[returned]), 0.0)
+    return state(granter, 0.0)
+
+
+def state(granter: Granter, real_s: float) -> str:
+    expire(granter.book, real_s, 0.0)
+    return granter.book.status_of(granter.book.jobs["j"]).state
+
+
+@given(st.lists(st.sampled_from("abc"), min_size=1))
+def test_an_arm_grants_a_job_until_arms_have_faulted_in_it_too_often(arms):
+    disk, done = Disk(), list[str]()
+    granter = restarted(disk, 0.0)
+    for number, arm in enumerate(arms):
+        done.append(arm)
+        now = attempt(granter, arm, number, {})
+        assert now == ("given_up" if reason_to_give_up(done) else "waiting")
+        if now == "given_up":
+            break
+    for each in (granter, restarted(disk, 0.0), restarted(Disk([*granter.book.compact()]), 0.0)):
+        assert state(each, 99.0) == ("given_up" if reason_to_give_up(done) else "waiting")
+        reply = each.answer_claim(claim("a", 999, entry("a-999")), 99.0)
+        if reason_to_give_up(done):
+            assert not reply.granted
+            assert reply.denied[0].outcome.outcome == "given_up"
+            assert reply.denied[0].outcome.reason == reason_to_give_up(done)
+        else:
+            assert reply.granted[0].faults == {f"{arm}-{number}": arm for number, arm in enumerate(arms)}
+
+
+def test_faults_known_to_different_arms_are_added_up(granter):
+    assert attempt(granter, "a", 0, {}) == "waiting"
+    assert attempt(granter, "b", 1, {"c-7": "c"}) == "given_up", "b has heard of a fault of c"
+
+
+def test_a_job_that_an_arm_has_is_not_given_up_and_finishing_it_counts_more(granter):
+    assert attempt(granter, "a", 0, {}) == "waiting"
+    have = entry("b-1", phase="working")
+    granter.answer_claim(claim("b", 1, have), 0.0)
+    granter.add_faults("j", {"a-9": "a"})  # heard late
+    assert granter.answer_claim(claim("b", 2, have), 0.1).granted
+    assert state(granter, 0.1) == "awarded"
+    granter.answer_claim(claim("b", 3), 0.2)  # b releases it
+    assert state(granter, 0.2) == "given_up"
+    granter.apply_outcome(JobOutcome("j", "b-1", "b", "finished", 9, 3.0))
+    assert state(granter, 0.3) == "finished"
+    granter.apply_outcome(JobOutcome("j", "b-1", "b", "given_up", 9, 3.0))
+    assert state(granter, 0.3) == "finished"
 
 
 # Claims

@@ -14,7 +14,7 @@ import pytest
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import ArmEvent, JobStatus
+from fleet.bus.protocol.auction import JobStatus
 from fleet.bus.protocol.operator import Alarm
 from fleet.errors import FleetError
 from fleet.live.auction.rounds import NOT_OFFERED
@@ -23,7 +23,6 @@ from fleet.live.monitor.snapshot import ArmSnapshot, AuctioneerSnapshot, FleetLi
 from scenarios.live import webhooks
 from scenarios.live.metrics import METRICS, exposition
 from scenarios.live.webhooks import MOST_WAITING, Webhook
-from tests.live.gateway.served import Served
 from tests.waiting import PATIENCE_S, wait_until
 
 ODD = 'a"b\\c\nd'
@@ -147,22 +146,6 @@ def test_an_alarm_is_shown_acknowledged_and_published(gateway, arm, router):
     line.close()
 
 
-def test_two_gateways_of_a_fleet_show_one_alarm_with_one_acknowledgement(gateway, arm, router):
-    with Served(router) as second:
-        arm.post(lambda: arm.set("twice lost job", state="given_up", reason="three faults"))
-
-        def alarm_of(shown):
-            found = [each for each in shown.ask("GET", "/v4/alarms")[2] if each["subject"] == "twice lost job"]
-            assert len(found) <= 1
-            return found and found[0]
-
-        first, other = (wait_until(lambda each=each: alarm_of(each)) for each in (gateway, second))
-        assert first["alarm"] == other["alarm"]
-        assert second.ask("POST", "/v4/alarms", {"alarm": first["alarm"], "by": "ann"})[0] == 200
-        wait_until(lambda: alarm_of(gateway)["by"] == "ann")
-        assert gateway.ask("POST", "/v4/alarms", {"alarm": first["alarm"], "by": "bob"})[0] == 409
-
-
 def test_an_alarm_of_a_monitor_that_has_exited_ends(gateway, router, monkeypatch):
     """Not while it is present, and not if it is about an auctioneer that the gateway has not heard."""
 
@@ -179,19 +162,6 @@ def test_an_alarm_of_a_monitor_that_has_exited_ends(gateway, router, monkeypatch
         wait_until(lambda: {"of it", "silence"} <= lasting())
     wait_until(lambda: "of it" not in lasting())
     assert "silence" in lasting()
-
-
-def test_events_of_unknown_kinds_are_counted_together(gateway, router):
-    with BusClient(router, "f") as link:
-        publish = link.publisher(keys.of_arm("f", "a+1", "event"), ArmEvent)
-        for number in range(200):
-            publish(ArmEvent("a+1", number, 1.0, f"kind {number}"))
-
-        def counted():
-            arms = gateway.ask("GET", "/v4/fleet")[2]["arms"]
-            return next((one["events"] for one in arms if one["arm"] == "a+1" and one["events"]), None)
-
-        assert set(wait_until(counted)) <= {"other"}
 
 
 async def receiver(replies, requests):

@@ -272,9 +272,8 @@ def test_the_keyboard_is_enough(served, fleet, open_page):
     assert wait_until(lambda: (np.abs(canvas(page) - before).max(axis=2) > 60).sum() > 300)
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_a_phone_shows_all_of_it(served, fleet, open_page, scheme):
-    page = open_page(served, viewport={"width": 390, "height": 800}, color_scheme=scheme)
+def test_a_dark_phone_shows_all_of_it(served, fleet, open_page):
+    page = open_page(served, viewport={"width": 390, "height": 800}, color_scheme="dark")
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
     for button in page.locator("button:visible").all():
         box = button.bounding_box()
@@ -282,36 +281,17 @@ def test_a_phone_shows_all_of_it(served, fleet, open_page, scheme):
         assert box["x"] + box["width"] <= 390
         assert box["height"] >= 30
     paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
-    assert (sum(map(int, re.findall(r"\d+", paper)[:3])) < 200) == (scheme == "dark")
+    assert sum(map(int, re.findall(r"\d+", paper)[:3])) < 200
 
 
 @pytest.mark.ci_slow
-def test_hostile_names_stay_text(router, open_page):
-    with MovingFleet(router, (EVIL_ARM,), fleet="f") as fleet, Served(router, page=LivePage()) as served:
-        page = open_page(served)
-        page.evaluate("() => { window.boom = () => { document.body.dataset.boom = 'yes'; }; }")
-        fleet.post(lambda: fleet.set(EVIL_TEXT, EVIL_TEXT, state="waiting", reason=EVIL_TEXT))
-        fleet.paused[EVIL_ARM] = EVIL_TEXT
-        for place in ("#journal", "#jobs", "#alert-list"):
-            expect(page.locator(place)).to_contain_text(SHOWN_TEXT)
-        expect(page.locator("#arms tbody th")).to_contain_text(EVIL_ARM)
-        assert page.get_by_role("button", name=f"Cancel {SHOWN_TEXT}").count() == 1
-        page.get_by_role("button", name=f"Resume {EVIL_ARM}").click()
-        expect(page.locator("#confirm-title")).to_have_text(f"Resume {EVIL_ARM}?")
-        page.locator("#back").click()
-        assert page.evaluate("document.querySelectorAll('img, main script').length") == 0
-        assert page.evaluate("document.body.dataset.boom") is None
-        page.close()  # before its gateway ends: it would try to connect again
-
-
-@pytest.mark.ci_slow
-def test_long_names_and_names_of_javascript_s_own_leave_the_page_as_it_is(router, open_page):
-    names = ("constructor", "__proto__", "W" * 120)
+def test_hostile_long_and_javascript_s_own_names_stay_text(router, open_page):
+    names = (EVIL_ARM, "constructor", "__proto__", "W" * 120)
     with MovingFleet(router, names, fleet="f") as fleet, Served(router, page=LivePage()) as served:
         page = open_page(served)
         fleet.post(lambda: fleet.set("q" * 120, arm="W" * 120, state="awarded"))
         expect(page.locator("#offers")).to_contain_text("W" * 120)
-        expect(page.locator("#arms tbody tr")).to_have_count(3)
+        expect(page.locator("#arms tbody tr")).to_have_count(4)
         expect(page.locator("#arms")).not_to_contain_text("paused")
         assert page.evaluate("document.documentElement.scrollWidth") <= 1300
         for cell in page.locator("#arms td, #jobs td, #journal td").all():
@@ -320,6 +300,18 @@ def test_long_names_and_names_of_javascript_s_own_leave_the_page_as_it_is(router
         confirm(page)
         answer(page).to_contain_text("Paused: __proto__.")
         expect(page.locator("#arms tr", has_text="__proto__")).to_contain_text("paused")
+        page.evaluate("() => { window.boom = () => { document.body.dataset.boom = 'yes'; }; }")
+        fleet.post(lambda: fleet.set(EVIL_TEXT, EVIL_TEXT, state="waiting", reason=EVIL_TEXT))
+        fleet.paused[EVIL_ARM] = EVIL_TEXT
+        for place in ("#journal", "#jobs", "#alert-list"):
+            expect(page.locator(place)).to_contain_text(SHOWN_TEXT)
+        expect(page.locator("#arms")).to_contain_text(EVIL_ARM)
+        assert page.get_by_role("button", name=f"Cancel {SHOWN_TEXT}").count() == 1
+        page.get_by_role("button", name=f"Resume {EVIL_ARM}").click()
+        expect(page.locator("#confirm-title")).to_have_text(f"Resume {EVIL_ARM}?")
+        page.locator("#back").click()
+        assert page.evaluate("document.querySelectorAll('img, main script').length") == 0
+        assert page.evaluate("document.body.dataset.boom") is None
         page.close()  # before its gateway ends: it would try to connect again
 
 

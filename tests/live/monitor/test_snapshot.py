@@ -31,11 +31,11 @@ def test_present_is_token_and_fresh_state(token, age_s, spoke):
     assert arm.state_age_s == (pytest.approx(age_s, abs=1e-9) if spoke else None)
 
 
-def test_the_hottest_motor_is_named_by_its_joint():
+def test_events_of_unknown_kinds_are_counted_together():
     seen = FleetView("f")
-    seen.update("a", state(), 0.0)
-    (arm,) = seen.snapshot(0.0).arms
-    assert (arm.hottest_c, arm.joint) == (52.5, 2)
+    for number in range(200):
+        seen.update("a", ArmEvent("a", number, 1.0, f"kind {number}" if number else "fault"), 0.0)
+    assert seen.snapshot(0.0).arms[0].events == {"fault": 1, "other": 199}
 
 
 def scores(time_s, **difficulty):

@@ -1,6 +1,5 @@
 """The `watch` screen and command."""
 
-import json
 import os
 import re
 import signal
@@ -19,13 +18,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.router import Router
 from fleet.live.monitor.snapshot import ArmSnapshot, FleetSnapshot, JobScore
 from scenarios.live.fleet_processes import free_port
-from scenarios.show.watch import (
-    GONE_S,
-    ShiftEnd,
-    format_age,
-    format_scores,
-    screen,
-)
+from scenarios.show.watch import GONE_S, ShiftEnd, format_age, format_scores, screen
 from tests import commands
 from tests.waiting import PATIENCE_S
 
@@ -125,13 +118,6 @@ def test_without_a_terminal_tables_are_printed_until_stopped(fleet):
         finally:
             process.kill()
             process.communicate(timeout=PATIENCE_S)
-
-
-def test_a_snapshot_is_json(fleet):
-    done = commands.run("bus", "watch", "--endpoint", fleet.endpoint, "--json")
-    told = json.loads(done.stdout)
-    assert told["fleet"] == "f"
-    assert [(arm["arm"], arm["token"], arm["present"]) for arm in told["arms"]] == [("a", True, False)]
 
 
 def test_the_end_of_a_shift_is_told_when_all_have_left():
