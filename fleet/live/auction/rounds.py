@@ -551,7 +551,7 @@ class Rounds:
         except JournalFull as error:
             _LOG.error("Nothing is awarded: %s", error)
             allocation = {}
-        left = bidding.after(allocation)
+        left = bidding.after(allocation) if allocation else bidding
         self._notes |= {job.name: reason_to_wait(left, job.name) for job in jobs if job.name not in allocation}
         if allocation:
             self._scan_s, self._pause_s = -math.inf, self._timing.pause_s[0]
