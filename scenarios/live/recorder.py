@@ -306,13 +306,15 @@ class GapFetcher:
     def _next_senders(self) -> tuple[str, ...]:
         """Return the senders of the next sweep: those of results and operations, which are few, first.
 
-        Of an auctioneer that is known by its results the only operation may be what is missing.
+        Of an auctioneer that is known by its results the only operation may be what is missing, and of an arm that is
+        known by its states the only event.
         """
         known = sorted({name.partition(", epoch")[0] for name in self._recorder.counts} - {""}, reverse=True)
         auctioneers = {name.partition(" of ")[2] for name in known if name.startswith(("results", "operations"))}
         both = [f"{kind} of {name}" for kind in ("results", "operations") for name in sorted(auctioneers)]
         central = both[:SWEEP_KEYS]
-        arms = [name for name in known if name.startswith("events")]
+        of_arms = (name.partition(" of ")[2] for name in known if name.startswith(("events", "telemetry")))
+        arms = [f"events of {name}" for name in dict.fromkeys(of_arms)]
         start, self._swept = self._swept % max(1, len(arms)), self._swept + SWEEP_KEYS
         return (*central, *dict.fromkeys((arms[start:] + arms)[:SWEEP_KEYS]))
 

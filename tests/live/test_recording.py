@@ -4,8 +4,10 @@ import dataclasses
 import json
 import re
 import threading
+import time
 from functools import partial
 from itertools import pairwise
+from unittest.mock import MagicMock
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -28,7 +30,7 @@ from fleet.events import Event
 from fleet.live.job_rules import EXPIRED
 from fleet.robot import ThermalLimits
 from scenarios.cli.main import main
-from scenarios.live.recorder import Recorder, record
+from scenarios.live.recorder import SWEEP_S, GapFetcher, Recorder, record
 from scenarios.live.recording import CARD, alarms_of, open_messages, read_card, read_parts, replay
 from scenarios.live.recording_report import heat_use, open_recording, order_events
 from scenarios.result_folder import lock_folder
@@ -98,6 +100,15 @@ def test_every_message_is_kept_once_and_gaps_are_known(tmp_path_factory, steps):
     gaps = read_parts(folder, "gaps").to_pylist()
     assert {tick for gap in gaps for tick in range(gap["first"], gap["last"] + 1)} == missing
     assert all("the recording ended" in gap["reason"] for gap in gaps)
+
+
+def test_events_are_sought_of_an_arm_that_is_known_by_its_states_alone(tmp_path):
+    """The only event of an arm may have been missed; nothing later shows that there was one."""
+    recorder, asked = Recorder.open(tmp_path, "f"), list[str]()
+    recorder.add("a", state("a", 1))
+    link = MagicMock(fleet="f", subscribe=lambda key, *_, **__: asked.append(key))
+    GapFetcher(recorder, lambda: link).step(time.monotonic() + SWEEP_S)
+    assert asked == [keys.of_arm("f", "a", "event")]
 
 
 def test_messages_of_a_restarted_arm_are_kept(tmp_path):
