@@ -180,7 +180,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.ci_slow
+@pytest.mark.slow  # CI builds the pages by `make docs`
 def test_pages_are_made_from_readme_docstrings_and_notebooks(site: Path) -> None:
     for page, content in (
         ("index.html", "Two commands"),
