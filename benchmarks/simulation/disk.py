@@ -142,7 +142,10 @@ class Disk:
 
     def write_at(self, file: File, start: int, content: bytes) -> None:
         """Write at a place of a file, as pwrite(2)."""
-        part = content[: self._rng.randrange(len(content) + 1)]
+        end = start + self._rng.randrange(len(content) + 1)
+        if end < len(file.data):  # what is there is replaced by whole sectors
+            end = max(start, end // SECTOR * SECTOR)
+        part = content[: end - start]
         if self.full:
             file.write(start, part)
             raise OSError(errno.ENOSPC, "No space left on device")

@@ -61,7 +61,7 @@ class NoReply(BusError):
     def __str__(self) -> str:
         if self.late:
             return f"The {replier(self.key)} did not reply in time."
-        return f"There is no {replier(self.key)} in this fleet."
+        return f"No {replier(self.key)} is online in this fleet."
 
 
 @dataclass(eq=False)

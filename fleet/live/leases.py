@@ -119,7 +119,7 @@ def clear(book: JobBook, arm: str, by: str, present: Set[str], lease_s: float, t
         arms = ", ".join(sorted(name for name, spaces in taken.items() if spaces))
         raise Refused(f"'{arm}' takes no space. Arms that do: {arms or 'none'}.")
     if not all(grant.silent for grant in grants):
-        raise RefusedForNow(f"The lease of '{arm}' has not ended; try again in {lease_s:g} s.")
+        raise RefusedForNow(f"The lease of '{arm}' has not ended; try again in at most {lease_s:g} s.")
     if taken.get(arm):
         book.record(*progress(book, [grant.record.job for grant in grants]), SpaceCleared(arm, by, time_s))
     return bool(taken.get(arm))

@@ -57,7 +57,7 @@ from fleet.bus.protocol.operator import (
     ResetRequest,
 )
 from fleet.env.render.heat import heat_scale
-from fleet.errors import NAME_RULE, BusError, FleetError, Refused, ScenarioError, is_name, nearest
+from fleet.errors import NAME_RULE, BusError, FleetError, Refused, ScenarioError, is_name, listed, nearest
 from fleet.live.job_client import batches
 from fleet.live.monitor.async_bridge import MONITOR, AsyncBridge, EventFeed, FeedEntry
 from fleet.live.monitor.health import Finding
@@ -384,6 +384,8 @@ def application(
         body = await read_body(request, ResetBody)
         if not is_name(body.arm):
             raise HTTPException(HTTPStatus.UNPROCESSABLE_ENTITY, f"The name of an arm must have {NAME_RULE}.")
+        if body.arm not in (known := [arm.arm for arm in (await bridge.snapshot(0)).arms]):
+            raise HTTPException(HTTPStatus.NOT_FOUND, f"There is no arm '{body.arm}'. Arms: {listed(known)}.")
         key = keys.of_arm(bridge.fleet, body.arm, "reset")
         return json_response(await ask(key, ResetRequest(body.by), ResetReply))
 

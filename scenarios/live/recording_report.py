@@ -76,9 +76,16 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
     limits, model = _cell(scenario, card.cell, arms)
     alarms = alarms_of(folder) if len(epochs) < 2 else []  # they name no epoch
     ordered = order_events(arm_events(log), _returns(results))
-    events = tuple(event for event in ordered if event.arm in arms)
-    telemetry = telemetry_of(table, arms)
     jobs = tuple(job_records(results))
+    due_s = {job.job: job.due_s for job in jobs}  # as last changed; an arm knows the date of its award
+    events = tuple(
+        replace(event, value=max(0.0, event.time_s - due_s[event.job]))
+        if event.kind == "finish" and event.job in due_s
+        else event
+        for event in ordered
+        if event.arm in arms
+    )
+    telemetry = telemetry_of(table, arms)
     shown = {
         "status": "running" if card.status == "recording" else card.status,
         "scenario": {"name": card.fleet},
@@ -399,8 +406,9 @@ def _alarm_notices(alarms: Sequence[Alarm], arms: Sequence[str], jobs: Sequence[
     for alarm in alarms:
         known = before.get(alarm.alarm)
         before[alarm.alarm] = alarm
-        changes = [(known is None, alarm.began_s, "alarm", alarm.what)]
-        seen = alarm.by and not (known and known.by)
+        begins = alarm.ended_s is None if known and known.ended_s is not None else known is None
+        changes = [(begins, alarm.began_s, "alarm", alarm.what)]
+        seen = alarm.by and (begins or not (known and known.by))
         changes.append((bool(seen), alarm.time_s, "alarm_acknowledged", f"by {alarm.by}: {alarm.what}"))
         ended = alarm.ended_s is not None and (known is None or known.ended_s is None)
         changes.append((ended, alarm.ended_s or 0.0, "alarm_ended", alarm.what))
@@ -416,7 +424,7 @@ def _halts(alarms: Sequence[Alarm], operations: pa.Table, results_s: Sequence[fl
     Args:
         results_s: Times of the results, ascending: the next one ends an alarm whose gateway has exited.
     """
-    for alarm in {alarm.alarm: alarm for alarm in alarms if alarm.kind == "silent"}.values():
+    for alarm in {(alarm.alarm, alarm.began_s): alarm for alarm in alarms if alarm.kind == "silent"}.values():
         end_s = next((s for s in results_s if s > alarm.time_s), math.inf) if alarm.ended_s is None else alarm.ended_s
         yield Halt(arm="", start_s=alarm.began_s, end_s=end_s, reason=f"{alarm.subject} did not reply")
     paused: dict[str, Halt] = {}

@@ -281,12 +281,14 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
     end_s = own[0].start_s if own else late.due_s if late.state == "expired" else log.plan.horizon_s
     took_s = (own[0].finished_s or own[0].end_s) - end_s if own else 0.0
     if begin_s + took_s > late.due_s:
-        return f"its work takes {duration(took_s)}, and it was due {duration(late.due_s - begin_s)} after its release"
+        wait_s = late.due_s - begin_s
+        due = f"{duration(abs(wait_s))} {'after' if wait_s >= 0 else 'before'} its release"
+        return f"its work takes {duration(took_s)}, and it was due {due}"
     offers = [offer for offer in log.offers if offer.job == late.job]
     offers = offers or [offer for offer in log.offers if stream_of(offer.job) == stream_of(late.job)]
     able = [arm for arm in log.arms if any(offer.feasible and offer.arm == arm for offer in offers)]
     if not able:
-        return "no arm got a job of its kind"
+        return "it was never awarded, and no offer for it is recorded"
     halts = {_halt(log, halt): halt for halt in log.halts if halt.start_s < late.due_s}
     waits_s = _arm_time(log, able, begin_s, end_s, halts)
     if all(each.start_s >= late.due_s for each in log.plan.breaks):

@@ -157,7 +157,7 @@ def test_to_ask_gets_a_reply_a_refusal_or_none(place):
     with pytest.raises(NoReply, match="in time"):  # the thread may still have dropped a first request
         here.link.ask(key, StatusRequest(), Status, timeout_s=0.1, attempts=3)
     here.other.close()
-    with pytest.raises(NoReply, match="There is no auctioneer in this fleet"):
+    with pytest.raises(NoReply, match="No auctioneer is online in this fleet"):
         here.link.ask(key, StatusRequest(), Status, timeout_s=PATIENCE_S)
 
 

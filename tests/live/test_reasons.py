@@ -67,6 +67,10 @@ def bidding(*quotes: Quote, **more: Any) -> Bidding:
         ),
         (bidding(quote("a", plans=(), reason="too far")), "No arm can do it: a: too far."),
         (
+            bidding(quote("a", plans=(), reason="too far"), unasked={"c": "is not present", "b": "is paused by 'ann'"}),
+            "No arm that was asked can do it, and b is paused by 'ann', c is not present.",
+        ),
+        (
             bidding(quote("a", plans=(), reason=NOT_PLANNED), quote("b", plans=(), reason="too far")),
             "Arms are planning its motion.",
         ),

@@ -396,7 +396,8 @@ def test_a_report_lists_alarms_and_requests_among_the_events_and_names_who(tmp_p
         recorder.add("boss", Operation("boss", 30.0 * number, ControlRequest(str(number), action, "<ann>"), number))
     hot = Alarm("m", 1, 45.0, "7d1f", "fault", "arm_0 is faulted.", "arm_0", began_s=44.0)
     seen = replace(hot, number=2, time_s=70.0, by="cleo", acknowledged="2026-01-31T09:00:00Z")
-    for alarm in (hot, seen, replace(seen, number=3, time_s=95.0, ended_s=88.0)):
+    over = replace(seen, number=3, time_s=95.0, ended_s=88.0)
+    for alarm in (hot, seen, over, replace(hot, number=4, time_s=131.0, began_s=130.0)):
         recorder.add("m", alarm)
     recorder.write(status="finished")
     html = open_recording(tmp_path / "r").page()
@@ -410,6 +411,7 @@ def test_a_report_lists_alarms_and_requests_among_the_events_and_names_who(tmp_p
         ["0:01:28", "alarm ended", "arm_0", "", "arm_0 is faulted."],
         ["0:01:30", "settle", "", "c-1", "as redo, by &lt;ann&gt;"],
         ["0:02:00", "resume", "arm_0", "", "by &lt;ann&gt;"],
+        ["0:02:10", "alarm", "arm_0", "", "arm_0 is faulted."],
     ]
     assert "<td>jobs submitted by bob</td><td>1</td>" in html
 
@@ -475,6 +477,9 @@ def test_a_job_that_waits_while_nobody_replies_is_late_by_that_and_not_by_its_ar
         for time_s, kind in ((5.0, "award"), (79.0, "finish"), (79.5, "home"))
     ]
     assert record_wait(tmp_path / "6", 40.0, [silent], before=busy).startswith(f"{waits}boss did not reply")
+    later = replace(silent, number=2, time_s=95.0, began_s=85.0, ended_s=95.0)
+    assert record_wait(tmp_path / "7", 40.0, [silent, later]) == f"{waits}boss did not reply from 0:00:20 to 0:01:15."
+    assert record_wait(tmp_path / "8", 0.0, [silent]).startswith(waits)  # the due date was changed after the award
     short = replace(silent, began_s=45.0, ended_s=60.0)
     assert record_wait(tmp_path / "3", 40.0, [short]).startswith(f"{waits}arm_0 was idle")
     paused = [(15.0, Pause("arm_0")), (78.0, Resume())]

@@ -69,6 +69,8 @@ class Bidding:
     excludes: Excludes = no_conflicts
     absent: frozenset[str] = frozenset()
     """Arms that may take space and are not present."""
+    unasked: Mapping[str, str] = field(default_factory=dict[str, str])
+    """Why other known arms have not quoted, by arm."""
 
     def offer(self, arm: str, job: str, plan: int = 0) -> PlanQuote | None:
         """Return what an arm quotes for a plan of a job of the round; None if it is not open."""
@@ -239,6 +241,9 @@ def reason_to_wait(bidding: Bidding, job: str) -> str:
     refusals = {arm: each.reason or "infeasible" for arm, each in estimates.items() if not each.feasible}
     if NOT_PLANNED in refusals.values():
         return "Arms are planning its motion."
+    if not able and bidding.unasked:
+        others = ", ".join(f"{arm} {why}" for arm, why in sorted(bidding.unasked.items()))
+        return f"No arm that was asked can do it, and {others}."[:MAX_REASON]
     if not able:
         return no_arm_can(refusals)
     plans = [(arm, plan) for arm in able.keys() & bidding.quotes for plan in able[arm]]
@@ -446,8 +451,10 @@ class Rounds:
             return "No arm is present."
         if all(map(book.is_paused, self.present)):
             return "All present arms are paused."
-        reason = why_not_ready(job, self._time_s, book.is_finished, busy)
-        return reason or self._notes.get(job.name, NOT_OFFERED.format(self._timing.max_jobs))
+        if reason := why_not_ready(job, self._time_s, book.is_finished, busy):
+            return reason
+        most, soon = self._timing.max_jobs, "It waits to be offered in the next round."
+        return self._notes.get(job.name, NOT_OFFERED.format(most) if len(book.waiting) > most else soon)
 
     def is_planned(self, job: str) -> bool:
         """Return whether an arm has a plan for a waiting job, or all have said that there is none."""
@@ -543,6 +550,7 @@ class Rounds:
             taken=taken,
             excludes=self._excludes,
             absent=frozenset(taken.keys() - self.present),
+            unasked={arm: self._why_unasked(arm) for arm in (self.present | taken.keys()) - quotes.keys()},
         )
         self._planned |= planned_jobs(quotes)
         allocation = drop_invalid(bidding, self.allocate(bidding)) if bidding.quotes and jobs else {}
@@ -559,6 +567,12 @@ class Rounds:
             if not bidding.quotes:  # no arm has capacity for any job
                 self._scan_s = real_s + self._pause_s
             self.delay(real_s, (job.name for job in closing.jobs))
+
+    def _why_unasked(self, arm: str) -> str:
+        paused = self._book.operations.paused
+        if arm not in self.present:
+            return "is not present"
+        return f"is paused by '{paused[arm]}'" if arm in paused else "has not answered in time"
 
     def _may_work(self, arm: str, closing: Round) -> bool:
         return arm in closing.asked & self.present and not self._book.is_paused(arm)

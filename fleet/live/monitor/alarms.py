@@ -23,9 +23,9 @@ LASTING = {
 """Texts of alarms whose findings name a state of the moment, by kind."""
 HOLD_S = 5.0
 """Real seconds without the finding after which an alarm ends: a finding that comes and goes raises one alarm."""
-BEGIN_S = {"absent": 3.0, "space": 3.0}
+BEGIN_S = {"absent": 3.0, "space": 3.0, "no_progress": 10.0}
 """Real seconds that a finding of these kinds must last before it raises an alarm: every arm is absent for a moment
-while the router restarts."""
+while the router restarts, and the reasons of jobs are some seconds old."""
 OF_FLEET = ("no_progress", "webhook")
 """Kinds of alarms whose subject is neither arm nor job: they end with their finding, whoever is heard."""
 
@@ -134,6 +134,8 @@ class AlarmList:
         if not by.strip():
             raise Refused("An acknowledgement needs the name of a person.")
         alarm = self.alarms[name]
+        if alarm.by == by.strip():
+            return alarm
         if alarm.by:
             raise Refused(f"'{alarm.by}' has acknowledged it at {alarm.acknowledged}.")
         at = now.astimezone(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")

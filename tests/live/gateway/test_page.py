@@ -159,7 +159,8 @@ def test_a_fault_is_reset_over_http(served, moving):
     assert moving.requests[-1] == ResetRequest("ann")
     assert served.ask(*token, {"arm": "arm_1"})[2]["changed"] is False
     status, _, told = served.ask(*token, {"arm": "nobody"})
-    assert (status, told["detail"]) == (503, "There is no arm 'nobody' in this fleet.")
+    assert status == 404
+    assert told["detail"].startswith("There is no arm 'nobody'. Arms: arm_0, arm_1")
     assert served.ask(*token, {"arm": "a/b"})[0] == 422
 
 
@@ -311,7 +312,7 @@ def test_a_slow_body_is_a_timeout(router, monkeypatch):
 def test_without_an_auctioneer_the_gateway_says_so():
     with Router() as empty, Served(empty.endpoint) as served:
         status, _, told = served.ask("POST", "/v4/jobs", {"jobs": [CRATE_JSON]})
-        assert (status, told["detail"]) == (503, "There is no auctioneer in this fleet.")
+        assert (status, told["detail"]) == (503, "No auctioneer is online in this fleet.")
         status, _, told = served.ask("GET", "/v4/fleet")
         assert (status, told["arms"]) == (200, [])
 

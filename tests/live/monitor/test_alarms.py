@@ -41,12 +41,12 @@ def test_an_alarm_lasts_from_the_first_finding_until_a_pause_longer_than_the_hol
 def test_a_restart_continues_the_alarms_of_its_messages():
     """The same finding raises no second alarm; who has seen it is kept; one that is gone ends after the hold."""
     first = AlarmList("m", {})
-    sent = first.update([HOT, Finding("fault", "no one works", "no_progress", "space")], 10.0, 1000.0)
+    sent = first.update([HOT, Finding("fault", "no one works", "webhook", "space")], 10.0, 1000.0)
     sent.append(first.acknowledge(sent[0].alarm, " ann ", 12.0, NOON))
     again = AlarmList("m", {}, sent)
     assert again.update([HOT], 20.0, 3000.0) == []
     (ended,) = again.update([HOT], 26.0 + HOLD_S, 3006.0 + HOLD_S)
-    assert (ended.kind, ended.ended_s, ended.number) == ("no_progress", 20.0, 4)  # when it was last there
+    assert (ended.kind, ended.ended_s, ended.number) == ("webhook", 20.0, 4)  # when it was last there
     kept = again.alarms[sent[0].alarm]
     assert (kept.by, kept.acknowledged, kept.ended_s) == ("ann", "2026-01-31T12:00:00Z", None)
     with pytest.raises(Refused, match="'ann' has acknowledged it at 2026-01-31T12:00:00Z"):
@@ -64,7 +64,7 @@ def test_a_recording_keeps_the_alarms_of_a_gateway_that_starts_again_beside_a_ne
         for start_s, time_s in ((1.76e9, 500.0), (1.76e9 + 9, 0.0))
         for alarms in [AlarmList("gateway", {}, start_s=start_s)]
         for step in (0, 1)
-        for change in alarms.update([HOT, Finding("fault", "no one", "no_progress", str(step))], time_s + step, step)
+        for change in alarms.update([HOT, Finding("fault", "no one", "webhook", str(step))], time_s + step, step)
     ]
     for change in sent:
         recorder.add("gateway", change)
@@ -139,7 +139,7 @@ def test_a_late_message_of_an_alarm_changes_nothing_and_a_new_epoch_does():
 
 
 def test_an_alarm_about_no_participant_ends_with_its_finding():
-    waits = Finding("fault", "no one works", "no_progress", "space")
+    waits = Finding("fault", "no one works", "webhook", "space")
     alarms = AlarmList("m", {})
     alarms.update([waits], 0.0, 0.0, heard={"a"})
     (ended,) = alarms.update([], 9.0, 9.0, heard={"a"})
@@ -223,7 +223,10 @@ def test_an_absence_raises_an_alarm_once_it_lasts_and_the_end_of_the_shift_raise
     assert alarms.update([], 480.0, 3.0) == []
     for real_s in (5.0, 7.0):
         assert alarms.update([lasting, closed], 300.0 + 60 * real_s, real_s, speed=60.0) == []
-    begun, space = alarms.update([lasting, closed], 780.0, 8.0, speed=60.0)
+    waiting = Finding("fault", "2 jobs wait though no arm works and a is idle.", "no_progress", "busy")
+    begun, space = alarms.update([waiting, lasting, closed], 780.0, 8.0, speed=60.0)
+    assert alarms.update([waiting, lasting, closed], 1320.0, 17.0, speed=60.0) == []
+    assert [each.began_s for each in alarms.update([waiting, lasting, closed], 1380.0, 18.0, speed=60.0)] == [780.0]
     assert (begun.began_s, space.began_s) == (600.0, 600.0)
     assert begun.what == "arm_1 is absent: it has left, or its process hangs or has ended."
     assert space.what.startswith("The space of arm_1 stays closed to other arms, as it is not present. Clear it once")
