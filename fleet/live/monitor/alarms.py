@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from fleet.bus.protocol.operator import ALARMS_PER_START, Alarm
 from fleet.errors import Refused
 from fleet.live.monitor.health import Finding
-from fleet.live.monitor.snapshot import MAX_ALARMS
+from fleet.live.monitor.snapshot import MAX_ALARMS, STATUS_EVERY_S
 
 LASTING = {
     "absent": "{} is absent: it has left, or its process hangs or has ended.",
@@ -23,9 +23,10 @@ LASTING = {
 """Texts of alarms whose findings name a state of the moment, by kind."""
 HOLD_S = 5.0
 """Real seconds without the finding after which an alarm ends: a finding that comes and goes raises one alarm."""
-BEGIN_S = {"absent": 3.0, "space": 3.0, "no_progress": 10.0}
+BEGIN_S = {"absent": 3.0, "space": 3.0, "silent": STATUS_EVERY_S + 1.0, "no_progress": 10.0}
 """Real seconds that a finding of these kinds must last before it raises an alarm: every arm is absent for a moment
-while the router restarts, and the reasons of jobs are some seconds old."""
+while the router restarts, an auctioneer is asked anew only after a longer outage, and reasons of jobs are some seconds
+old."""
 OF_FLEET = ("no_progress", "webhook")
 """Kinds of alarms whose subject is neither arm nor job: they end with their finding, whoever is heard."""
 
