@@ -306,12 +306,12 @@ class GapFetcher:
     def _next_senders(self) -> tuple[str, ...]:
         """Return the senders of the next sweep: those of results and operations, which are few, first.
 
-        Of an auctioneer that is known by its results the only operation may be what is missing, and of an arm that is
-        known by its states the only event.
+        Of an auctioneer that is known by its results the only operation may be what is missing, of an arm that is known
+        by its states the only event, and of an auctioneer that is not known, "*", all.
         """
         known = sorted({name.partition(", epoch")[0] for name in self._recorder.counts} - {""}, reverse=True)
         auctioneers = {name.partition(" of ")[2] for name in known if name.startswith(("results", "operations"))}
-        both = [f"{kind} of {name}" for kind in ("results", "operations") for name in sorted(auctioneers)]
+        both = [f"{kind} of {name}" for kind in ("results", "operations") for name in sorted(auctioneers) or ["*"]]
         central = both[:SWEEP_KEYS]
         of_arms = (name.partition(" of ")[2] for name in known if name.startswith(("events", "telemetry")))
         arms = [f"events of {name}" for name in dict.fromkeys(of_arms)]
@@ -328,7 +328,7 @@ class GapFetcher:
         for sender in senders:
             kind, _, name = sender.partition(" of ")
             source = SOURCES[cast(Kind, kind)]
-            key = str(keys.ParsedKey(link.fleet, source.role, name, source.topic))
+            key = keys.build(link.fleet, source.role, source.topic, None if name == "*" else name)
             link.subscribe(key, source.message, self._recorder.add, history=True)
 
     def _count(self) -> None:

@@ -108,7 +108,8 @@ def test_events_are_sought_of_an_arm_that_is_known_by_its_states_alone(tmp_path)
     recorder.add("a", state("a", 1))
     link = MagicMock(fleet="f", subscribe=lambda key, *_, **__: asked.append(key))
     GapFetcher(recorder, lambda: link).step(time.monotonic() + SWEEP_S)
-    assert asked == [keys.of_arm("f", "a", "event")]
+    of_auctioneers = [keys.of_every("f", "auction", topic) for topic in ("result", "operation")]
+    assert asked == [*of_auctioneers, keys.of_arm("f", "a", "event")]
 
 
 def test_messages_of_a_restarted_arm_are_kept(tmp_path):
