@@ -99,15 +99,20 @@ def series_of(message: Message) -> Series:
         case State():
             return Series(f"telemetry of {message.arm}", message.tick, message.epoch, 1, False, whole=False)
         case ArmEvent(number=number):
-            first = number // EVENTS_PER_BOOT * EVENTS_PER_BOOT + 1
+            first = _first_of_start(number, EVENTS_PER_BOOT)
             return Series(f"events of {message.arm}", number, message.epoch, first, False)
         case Result():
             return Series(f"results of {message.auctioneer}", message.number, message.epoch, 0, True)
         case Operation():
             return Series(f"operations of {message.auctioneer}", message.number, message.epoch, 0, True)
         case Alarm():
-            first = message.number // ALARMS_PER_START * ALARMS_PER_START + 1
+            first = _first_of_start(message.number, ALARMS_PER_START)
             return Series(f"alarms of {message.monitor}", message.number, "", first, False)
+
+
+def _first_of_start(number: int, per_start: int) -> int:
+    """First number since the start of a sender, of which each start has a block of this many numbers."""
+    return number // per_start * per_start + 1
 
 
 class Recorder:

@@ -406,9 +406,10 @@ def _alarm_notices(alarms: Sequence[Alarm], arms: Sequence[str], jobs: Sequence[
     for alarm in alarms:
         known = before.get(alarm.alarm)
         before[alarm.alarm] = alarm
-        begins = alarm.ended_s is None if known and known.ended_s is not None else known is None
-        changes = [(begins, alarm.began_s, "alarm", alarm.what)]
-        seen = alarm.by and (begins or not (known and known.by))
+        if known and known.ended_s is not None and alarm.ended_s is None:  # it begins again
+            known = None
+        changes = [(known is None, alarm.began_s, "alarm", alarm.what)]
+        seen = alarm.by and not (known and known.by)
         changes.append((bool(seen), alarm.time_s, "alarm_acknowledged", f"by {alarm.by}: {alarm.what}"))
         ended = alarm.ended_s is not None and (known is None or known.ended_s is None)
         changes.append((ended, alarm.ended_s or 0.0, "alarm_ended", alarm.what))

@@ -58,7 +58,7 @@ class AlarmList:
         self._first_s: dict[str, float] = {}
         """Real second since which this monitor has had each present finding, by the name of its alarm."""
         numbers = (alarm.number for alarm in kept if alarm.monitor == monitor)
-        self._number = max(int(start_s) * ALARMS_PER_START, *numbers, 0)
+        self._number = max(int(start_s) * ALARMS_PER_START, max(numbers, default=0))
         for name, alarm in {alarm.alarm: alarm for alarm in kept}.items():
             if alarm.monitor == monitor:
                 self.alarms[name] = alarm
