@@ -12,7 +12,7 @@ from typing import Any
 from benchmarks.simulation.recording import Sent
 from benchmarks.simulation.world import Violation
 from fleet.bus.protocol.auction import Result
-from fleet.bus.protocol.operator import ALL_ARMS, Cancel, Change, Operation, Pause, Resume, Settle
+from fleet.bus.protocol.operator import ALL_ARMS, Cancel, Change, Clear, Operation, Pause, Resume, Settle
 
 
 def check_steering(sent: Sent, states: Mapping[str, str], jobs: Mapping[str, Any]) -> None:
@@ -37,7 +37,7 @@ def check_steering(sent: Sent, states: Mapping[str, str], jobs: Mapping[str, Any
         later, action = operations[number + 1 :], operation.request.action
         if isinstance(action, Pause):
             _check_pause(operation, action, later, awards)
-        elif not isinstance(action, Resume):
+        elif not isinstance(action, Resume | Clear):
             _check_job(operation, [each for each in later if _job(each) == action.job], awards, states, jobs)
 
 

@@ -174,6 +174,11 @@ class Connection(Session):
         super().__init__()
         self._endpoint, self._timeout_s, self._stopped = endpoint, timeout_s, stopped
 
+    @property
+    def connected(self) -> bool:
+        """Whether it has a connection to a router now; a lost one is restored by Zenoh."""
+        return self._session is not None and bool(self._session.info.routers_zid())
+
     def _new_session(self) -> zenoh.Session:
         if self._stopped is None:
             return open_client(self._endpoint, timeout_s=self._timeout_s)

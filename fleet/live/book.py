@@ -33,7 +33,19 @@ from fleet.bus.protocol.auction import ABANDONED, SETTLED, Admission, JobSpec, J
 from fleet.bus.protocol.consensus import JobOutcome
 from fleet.bus.protocol.keys import HISTORY
 from fleet.bus.protocol.messages import MOST_COUNT
-from fleet.bus.protocol.operator import ALL_ARMS, Cancel, Change, Operation, Pause, Resume, Settle
+from fleet.bus.protocol.operator import (
+    ALL_ARMS,
+    MAX_REQUEST_NAME,
+    Cancel,
+    Change,
+    Clear,
+    ControlRequest,
+    Operation,
+    Pause,
+    Resume,
+    Settle,
+    by_whom,
+)
 from fleet.errors import JournalFull
 from fleet.job import reason_to_give_up
 from fleet.live.job_rules import (
@@ -199,7 +211,7 @@ class JobBook(TimedState[BookRecord]):
         for record in records:
             for change in self.apply(record):
                 self._announce(change)
-            if isinstance(record, Requested):
+            if isinstance(record, Requested | SpaceCleared):
                 self._announce(self.requested[-1])
         for award in self.leases.keys() - self.open.keys():
             del self.leases[award]
@@ -244,8 +256,10 @@ class JobBook(TimedState[BookRecord]):
             self._in_order = [job.name for job in sorted(specs, key=job_order)]
         return self._in_order
 
-    def admit(self, jobs: Sequence[JobSpec], later: Mapping[str, JobSpec] | None = None) -> tuple[Admission, ...]:
-        """Return which submitted jobs can be accepted; changes nothing.
+    def admit(
+        self, jobs: Sequence[JobSpec], time_s: float, later: Mapping[str, JobSpec] | None = None
+    ) -> tuple[Admission, ...]:
+        """Return which submitted jobs can be accepted at a fleet time; changes nothing.
 
         Args:
             later: Jobs that will be accepted, by name.
@@ -263,6 +277,7 @@ class JobBook(TimedState[BookRecord]):
             ended=self.ended,
             given_up=given_up,
             past=self.past,
+            time_s=time_s,
         )
 
     def ready(self, time_s: float, limit: int, *, excluded: Container[str] = ()) -> list[JobSpec]:
@@ -400,12 +415,12 @@ class JobBook(TimedState[BookRecord]):
                 if (entry := self._entry(job)) is not None:
                     entry.count(cycles)
             case Released():
-                by = "" if record.outcome == "refused" else self._pauser(record.job, record.award)
-                changed = self._release(record, by)
+                pauser = None if record.outcome == "refused" else self._pauser(record.job, record.award)
+                by, changed = pauser or "", self._release(record, pauser)
             case JobSettled(outcome):
-                if outcome.outcome == "returned" and not outcome.faults:
-                    by = self._pauser(outcome.job, outcome.award)
-                changed = self._settle(outcome, by)
+                returned = outcome.outcome == "returned" and not outcome.faults
+                pauser = self._pauser(outcome.job, outcome.award) if returned else None
+                by, changed = pauser or "", self._settle(outcome, pauser)
             case Faulted(job, faults):
                 if (entry := self._entry(job)) is not None:
                     entry.faults |= faults
@@ -413,9 +428,7 @@ class JobBook(TimedState[BookRecord]):
             case HistoryAdopted():
                 changed = self._adopt(record)
             case Requested(operation):
-                number = self.operated if self.is_central else 0
-                self.requested.append(replace(operation, number=number))
-                self.operated += 1
+                self._number(operation)
                 by, changed = operation.request.by, self._operate(operation)
             case ShiftEnded():
                 self.ended = True
@@ -424,8 +437,10 @@ class JobBook(TimedState[BookRecord]):
                     self._move(entry, "waiting", entry.reason)
             case SpaceTaken():
                 self.space[record.arm] = frozenset(record.space)
-            case SpaceCleared(arm):
-                changed = self._clear(arm)
+            case SpaceCleared(arm, by):
+                request = ControlRequest(f"clear-{record.time_s:.3f}-{arm}"[:MAX_REQUEST_NAME], Clear(arm), by)
+                self._number(Operation(self.name, record.time_s, request, epoch=self.epoch if self.is_central else ""))
+                changed = self._clear(arm, by)
             case EpochBegun():
                 self.epoch, self.succeeds = record.epoch, record.succeeds
             case ClaimNumbered(arm, number):
@@ -487,16 +502,16 @@ class JobBook(TimedState[BookRecord]):
         if moved:
             self.space[arm] = self.space.get(arm, frozenset()) | {grant.record.space}
 
-    def _pauser(self, job: str, award: str) -> str:
-        """Return who paused the arm that gives a job back; "" if it has another reason to."""
+    def _pauser(self, job: str, award: str) -> str | None:
+        """Return who paused the arm that gives a job back, "" for nobody named; None if it has another reason to."""
         entry = self.jobs.get(job)
         grant = None if entry is None or entry.award != award else entry.grant
         if entry is None or grant is None or grant.may_commit or entry.state == "unfinished":
-            return ""
+            return None
         paused = self.operations.paused
-        return paused.get(grant.record.arm, paused.get(ALL_ARMS, ""))
+        return paused.get(grant.record.arm, paused.get(ALL_ARMS))
 
-    def _release(self, record: Released, pauser: str) -> list[JobEntry]:
+    def _release(self, record: Released, pauser: str | None) -> list[JobEntry]:
         entry = self.jobs.get(record.job)
         grant = None if entry is None else entry.grants.get(record.award)
         if entry is None or grant is None or grant.outcome:
@@ -505,7 +520,7 @@ class JobBook(TimedState[BookRecord]):
         entry.count(record.cycles)
         if entry.award != record.award or entry.outcome is not None:
             return self._give_up(entry)
-        return self._wait(entry, f"Its arm was paused by '{pauser}'." if pauser else record.reason)
+        return self._wait(entry, record.reason if pauser is None else f"Its arm was paused{by_whom(pauser)}.")
 
     def is_news(self, outcome: JobOutcome) -> bool:
         """Return whether an outcome tells more than what is known of the job.
@@ -529,7 +544,7 @@ class JobBook(TimedState[BookRecord]):
             return False
         return entry.outcome is None or weight_of(outcome) > weight_of(entry.outcome)
 
-    def _settle(self, outcome: JobOutcome, pauser: str = "") -> list[JobEntry]:
+    def _settle(self, outcome: JobOutcome, pauser: str | None = None) -> list[JobEntry]:
         """Apply the outcome of a job, or of an attempt at it."""
         news, finished = self.is_news(outcome), outcome.outcome == "finished"
         if (entry := self._entry(outcome.job)) is None:
@@ -550,7 +565,7 @@ class JobBook(TimedState[BookRecord]):
             if was_open:
                 entry.returns, entry.returned_s = entry.returns + 1, outcome.time_s
             why = outcome.reason if was_open or outcome.faults else entry.reason or outcome.reason
-            return self._wait(entry, f"Its arm was paused by '{pauser}'." if pauser else why)
+            return self._wait(entry, why if pauser is None else f"Its arm was paused{by_whom(pauser)}.")
         return self._set(entry, outcome) if news else self._give_up(entry)
 
     def _set(self, entry: JobEntry, outcome: JobOutcome) -> list[JobEntry]:
@@ -600,11 +615,17 @@ class JobBook(TimedState[BookRecord]):
             return JobOutcome(entry.name, award, entry.faults[award], "given_up", entry.cycles, self.time_s, reason)
         return None
 
+    def _number(self, operation: Operation) -> None:
+        """Number a request of a person, which is to be published."""
+        self.requested.append(replace(operation, number=self.operated if self.is_central else 0))
+        self.operated += 1
+
     def _operate(self, operation: Operation) -> list[JobEntry]:
         """Carry out a request of a person; return what has changed."""
-        self.operations.add(operation)
+        # Peers may know other requests, in which it changes something.
+        self.operations.add(operation, counts=not (self.is_central and operation.note))
         action, by = operation.request.action, operation.request.by
-        if isinstance(action, Pause | Resume):
+        if isinstance(action, Pause | Resume | Clear):
             return []
         if (entry := self._entry(action.job)) is None:
             self.operations.forget(action.job)
@@ -627,7 +648,7 @@ class JobBook(TimedState[BookRecord]):
                 return self._redo(entry)
             cycles = entry.cycles if entry.spec is None else entry.spec.repetitions
             award, arm = entry.award or NO_AWARD, entry.arm
-            end = (arm or self.name or NO_AWARD, "finished", cycles, operation.time_s, f"Settled as done by '{by}'.")
+            end = (arm or self.name or NO_AWARD, "finished", cycles, operation.time_s, f"Settled as done{by_whom(by)}.")
             changes = self._set(entry, JobOutcome(entry.name, award, *end))
             entry.arm = arm
             return changes
@@ -646,10 +667,11 @@ class JobBook(TimedState[BookRecord]):
         if entry.state != "unfinished" or entry.outcome is not None or entry.grant is not None:
             return []
         entry.award = ""  # a late report on it that is unsure is settled, too
-        return self._wait(entry, f"To be redone, by '{redo.request.by}'.")
+        return self._wait(entry, f"To be redone{by_whom(redo.request.by)}.")
 
-    def _clear(self, arm: str) -> list[JobEntry]:
+    def _clear(self, arm: str, by: str) -> list[JobEntry]:
         """Free the space of an arm, and revoke its grants."""
+        cleared = f"The space of '{arm}' was cleared{by_whom(by)}"
         self.space[arm], changed = frozenset(), list[JobEntry]()
         for entry in list(self.jobs.values()):
             its = [grant for grant in entry.grants.values() if grant.record.arm == arm]
@@ -657,14 +679,14 @@ class JobBook(TimedState[BookRecord]):
                 grant.revoked = True
             if (grant := entry.grant) is not None and grant in its:
                 self.open.pop(grant.record.award, None)
-                reason = f"The space of '{arm}' was cleared; it was about to finish it."
+                reason = f"{cleared}; it was about to finish it."
                 if grant.may_commit:
                     grant.silent = True
                     self._move(entry, "unfinished", reason)
                     changed.append(entry)
                 else:
                     grant.outcome = "dropped"
-                    changed += self._wait(entry, f"The space of '{arm}' was cleared.")
+                    changed += self._wait(entry, f"{cleared}.")
             changed += self._redo(entry) if its else []
         return changed
 

@@ -73,6 +73,10 @@ class JobDesk(ABC):
         """
 
     @abstractmethod
+    def _trouble(self) -> str:
+        """Return why this participant accepts and awards no jobs; "" if it does."""
+
+    @abstractmethod
     def _statuses(self, names: tuple[str, ...]) -> Iterable[JobStatus]: ...
     @abstractmethod
     def _submit(self, submission: Submission) -> SubmissionReply: ...
@@ -84,7 +88,8 @@ class JobDesk(ABC):
     def _reply_status(self, request: StatusRequest) -> Status:
         self._check_first()
         book, statuses = self.book, self._statuses(request.jobs)
-        return status_reply(self._name, self.time_s, statuses, book.taken_space(), book.epoch, book.operations.paused)
+        known = book.taken_space(), book.epoch, book.operations.paused, self._trouble()
+        return status_reply(self._name, self.time_s, statuses, *known)
 
     def _reply_cell(self, _: CellRequest) -> Cell:
         self._check_first()

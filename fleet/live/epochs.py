@@ -10,6 +10,7 @@ the present arms have done and have.
 """
 
 from collections.abc import Iterable
+from statistics import median_high
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
@@ -35,6 +36,12 @@ def ask_arms(link: BusClient) -> tuple[History, ...]:
     """Return what the present arms have done and have."""
     key = keys.of_every_arm(link.fleet, "history")
     return tuple(link.query_and_wait(key, HistoryRequest(), History, timeout_s=REPLY_S).messages.values())
+
+
+def kept_time_s(histories: Iterable[History], epoch: str) -> float:
+    """Return the fleet time of an epoch that arms have kept without an auctioneer, the median; 0 if none has."""
+    times_s = [history.time_s for history in histories if history.time_s > 0.0 and history.epoch == epoch != ""]
+    return median_high(times_s) if times_s else 0.0
 
 
 def check_begin(fleet: str, histories: Iterable[History]) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Container, Iterable, Mapping, 
 from datetime import timedelta
 from hashlib import blake2b
 from itertools import accumulate
+from math import inf
 from struct import iter_unpack, pack
 
 import networkx as nx
@@ -127,6 +128,7 @@ def admit(
     ended: bool = False,
     given_up: Container[str] = (),
     past: PastJobs | None = None,
+    time_s: float = -inf,
 ) -> tuple[Admission, ...]:
     """Return which jobs of one submission can be accepted; they may name one another as predecessors in any order.
 
@@ -138,6 +140,7 @@ def admit(
         ended: Whether the shift is over.
         given_up: Known jobs that are given up: a job that waits for one is accepted, and given up too.
         past: Jobs that were settled long ago; they are known, too.
+        time_s: Fleet time: a job whose hard due date has passed is accepted, and given up.
     """
     past = past or PastJobs()
     count = len(known) if count is None else count
@@ -160,7 +163,9 @@ def admit(
             new[job.name] = job
     never = _never_ready(new, lambda name: name in known or name in past)
     reasons = [rejected.get(index) or never.get(job.name, "") for index, job in enumerate(jobs)]
-    notes = lost_jobs(new.values(), given_up)
+    late = "Its hard due date has passed, so it is given up."
+    notes = {job.name: late for job in new.values() if is_late(job, time_s)}
+    notes |= lost_jobs(new.values(), given_up)
     notes |= {job.name: _past_note(job.name, past) for job in jobs if job.name in past}
     replies = [
         Admission(job.name, not why, why or notes.get(job.name, "")) for job, why in zip(jobs, reasons, strict=True)
@@ -325,6 +330,7 @@ def status_reply(
     taken: Mapping[str, Iterable[str]],
     epoch: str = "",
     paused: Mapping[str, str] = NONE,
+    trouble: str = "",
 ) -> Status:
     """Return the reply to a status request.
 
@@ -333,9 +339,10 @@ def status_reply(
     Args:
         name: Name of the replier.
         taken: Names of the spaces that each arm may take.
+        trouble: Why the replier accepts and awards no jobs; "" if it does.
     """
     kept, space = list(statuses), {arm: tuple(sorted(names)) for arm, names in sorted(taken.items()) if names}
-    reply = Status(name, time_s, (), space, epoch, dict(paused))
+    reply = Status(name, time_s, (), space, epoch, dict(paused), trouble)
     if len(kept) > MOST_JOBS:
         kept = sorted(kept, key=lambda status: status.state in SETTLED)[:MOST_JOBS]
     sizes = accumulate((len(encode(status)) + 1 for status in kept), initial=len(encode(reply)))

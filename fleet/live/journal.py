@@ -415,11 +415,16 @@ class CompactingJournal(Generic[Record]):
 
 
 class TimeRecorder:
-    """Records fleet time, so that it continues after a restart and never decreases."""
+    """Records fleet time, so that it continues after a restart and never decreases.
+
+    Attributes:
+        failure: Why it could not be recorded last time; "" if it was.
+    """
 
     def __init__(self, journal: Journal[Any], state: TimedState[Any], real_s: float) -> None:
         """Compact the journal, which gave this state."""
         self._journal, self._state, self._recorded_s = journal, state, real_s
+        self.failure = ""
         journal.compact(*state.compact())
 
     def start_s(self, speed: float) -> float:
@@ -438,8 +443,10 @@ class TimeRecorder:
         try:
             self._journal.append(ClockTick(time_s))
         except JournalFull as error:
+            self.failure = str(error)
             _LOG.error("Could not record the fleet's time: %s", error)
         else:
+            self.failure = ""
             self._state.apply(ClockTick(time_s))
         if self._journal.needs_compaction:
             self._journal.compact(*self._state.compact())

@@ -4,7 +4,7 @@ from collections.abc import Container, Mapping, Set
 from dataclasses import dataclass
 
 from fleet.bus.protocol.auction import LEASE_S
-from fleet.errors import Refused, RefusedForNow
+from fleet.errors import Refused, RefusedForNow, listed
 from fleet.live.book import JobBook
 from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.journal import CommitPermitted, Progress, Released, SpaceCleared
@@ -116,8 +116,7 @@ def clear(book: JobBook, arm: str, by: str, present: Set[str], lease_s: float, t
     if arm in present:
         raise Refused(f"'{arm}' is present and says itself which space it takes. Stop it first, or move it home.")
     if arm not in book.space and not grants:
-        arms = ", ".join(sorted(name for name, spaces in taken.items() if spaces))
-        raise Refused(f"'{arm}' takes no space. Arms that do: {arms or 'none'}.")
+        raise Refused(f"There is no arm '{arm}'. Arms: {listed(sorted(taken))}.")
     if not all(grant.silent for grant in grants):
         raise RefusedForNow(f"The lease of '{arm}' has not ended; try again in at most {lease_s:g} s.")
     if taken.get(arm):

@@ -9,7 +9,18 @@ from msgspec.structs import replace
 from fleet.bus.protocol.auction import ABANDONED, Award, JobSpec, JobState, Name, Offers, Report, Result
 from fleet.bus.protocol.consensus import Faults, JobOutcome
 from fleet.bus.protocol.messages import Count
-from fleet.bus.protocol.operator import ALL_ARMS, Cancel, Change, ControlRequest, Operation, Pause, Resume, Settle
+from fleet.bus.protocol.operator import (
+    ALL_ARMS,
+    Cancel,
+    Change,
+    Clear,
+    ControlRequest,
+    Operation,
+    Pause,
+    Resume,
+    Settle,
+    by_whom,
+)
 from fleet.live.job_rules import MAX_OPEN_JOBS, changed_spec, content_hash, hash_of
 from fleet.live.journal import (
     ClockTick,
@@ -278,12 +289,12 @@ Slot = tuple[str, str]
 
 def requested_job(request: ControlRequest) -> str:
     """Return the name of the job of a request; "" if it is for arms."""
-    return "" if isinstance(request.action, Pause | Resume) else request.action.job
+    return "" if isinstance(request.action, Pause | Resume | Clear) else request.action.job
 
 
 def cancelled_by(operation: Operation) -> str:
     """Return why a job is cancelled."""
-    return f"Cancelled by '{operation.request.by}'."
+    return f"Cancelled{by_whom(operation.request.by)}."
 
 
 def _slots(request: ControlRequest) -> tuple[Slot, ...]:
@@ -298,6 +309,8 @@ def _slots(request: ControlRequest) -> tuple[Slot, ...]:
             return (("pause", arm),)
         case Resume(arm):
             return (("pause", arm), ("resume", arm)) if arm == ALL_ARMS else (("pause", arm),)
+        case Clear():
+            return ()
 
 
 def _stamp(operation: Operation | None) -> tuple[float, str]:
@@ -328,13 +341,13 @@ class Operations:
         changes = any(_stamp(operation) > _stamp(self.latest.get(slot)) for slot in _slots(operation.request))
         return changes or operation.request.request not in self.names
 
-    def add(self, operation: Operation) -> None:
-        """Add a request."""
+    def add(self, operation: Operation, *, counts: bool = True) -> None:
+        """Add a request; one that does not count is only known by its name."""
         self.names[operation.request.request] = content_hash(operation.request)
         while len(self.names) > MAX_REQUESTS:
             del self.names[next(iter(self.names))]
         self.last_s = max(self.last_s, operation.time_s)
-        for slot in _slots(operation.request):
+        for slot in _slots(operation.request) if counts else ():
             if _stamp(operation) > _stamp(self.latest.get(slot)):
                 self._drop(slot)
                 self.latest[slot] = operation

@@ -4,17 +4,21 @@ import logging
 import math
 from collections.abc import Set
 
+from msgspec.structs import replace
+
 from fleet.bus.protocol.auction import SETTLED, JobStatus
 from fleet.bus.protocol.operator import (
     ALL_ARMS,
     Cancel,
     Change,
+    Clear,
     Controlled,
     ControlRequest,
     Operation,
     Pause,
     Resume,
     Settle,
+    by_whom,
 )
 from fleet.errors import Refused, listed
 from fleet.live.book import JobBook
@@ -50,7 +54,7 @@ def carry_out(book: JobBook, request: ControlRequest, arms: Set[str], time_s: fl
             )
         return None, ALREADY_DONE
     note = objection(book, request, arms)
-    operation = operation_of(book, request, time_s)
+    operation = replace(operation_of(book, request, time_s), note=note)
     book.record(*progress(book, [requested_job(request)]), Requested(operation))
     _LOG.warning("'%s' requested: %s", request.by, request.action)
     return operation, note
@@ -80,12 +84,19 @@ def objection(book: JobBook, request: ControlRequest, arms: Set[str]) -> str:
     match request.action:
         case Pause(arm):
             _check_arm(book, arm, arms)
-            return NO_CHANGE if arm in paused else ""
+            if arm not in paused:
+                return ""
+            before = f"paused{by_whom(paused[arm])}"
+            if book.is_central or paused[arm] == request.by:
+                return f"Nothing changed: it is {before} already."
+            return f"It was {before} before; the latest request counts."  # peers agree on it whatever they have heard
         case Resume(arm):
             _check_arm(book, arm, arms)
             if arm != ALL_ARMS and ALL_ARMS in paused:
                 raise Refused("All arms are paused. Resume all; then pause those that must stay paused.")
             return "" if (paused if arm == ALL_ARMS else arm in paused) else NO_CHANGE
+        case Clear():
+            raise Refused("Space is freed by a request to jobs/clear, or by thermofleet arm clear.")
         case Cancel() | Settle() | Change() as action:
             return _objection_to_job(book, action)
 

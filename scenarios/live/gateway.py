@@ -23,6 +23,7 @@ from functools import cached_property, partial
 from http import HTTPStatus
 from pathlib import Path
 from typing import (
+    Annotated,
     Any,  # values of JSON
     Literal,
     TypeVar,
@@ -100,6 +101,12 @@ HEADER_S = 5.0
 """Real seconds until a connection without a complete request is closed."""
 TABLE = "text/csv"
 """Content type of a job table."""
+PARAMETERS: Mapping[tuple[str, str], Sequence[str]] = {
+    ("GET", "/v4/fleet"): ("jobs",),
+    ("GET", "/v4/jobs"): ("job",),
+    ("POST", "/v4/jobs"): ("shift_begin", "by"),
+}
+"""Query parameters of a request, by method and path; of all others none."""
 PAGE = "dashboard.html"
 FILES = ("page.css", "dashboard.css", "cell.js", "stream.js", "tables.js", "actions.js", "dashboard.js")
 TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
@@ -278,7 +285,7 @@ class AcknowledgeBody(msgspec.Struct, frozen=True):
     """Body of /v4/alarms: a person has seen an alarm."""
 
     alarm: str
-    by: Person
+    by: Annotated[Person, msgspec.Meta(min_length=1)]
     """Who has seen it."""
 
 
@@ -333,9 +340,11 @@ def application(
             return await request()
 
     async def fleet(request: Request) -> Response:
-        text = request.query_params.get("jobs", "")
-        jobs = int(text) if text.isdecimal() and len(text) < 5 else MAX_JOBS
-        return json_response(await bridge.snapshot(jobs))
+        text = request.query_params.get("jobs", str(MAX_JOBS))
+        if not (text.isdecimal() and len(text) < 6 and int(text) <= MAX_JOBS):
+            detail = f"?jobs=N is the number of jobs to list, 0..{MAX_JOBS} (got '{text[:64]}')."
+            raise HTTPException(HTTPStatus.UNPROCESSABLE_ENTITY, detail)
+        return json_response(await bridge.snapshot(int(text)))
 
     async def ask(key: str, message: msgspec.Struct, kind: type[Asked]) -> Asked:
         return await limited(lambda: bridge.ask(key, message, kind))
@@ -444,12 +453,15 @@ def application(
         ("GET", "/metrics", "monitor", metrics, "Figures in the text format of Prometheus."),
         ("POST", "/v4/ask", "submitter", post_ask, 'Quotes without submitting: {"jobs": […]}.'),
     ]
-    routes = [Route(path, _checked(role, handle), methods=[method]) for method, path, role, handle, _ in table]
+    handlers: dict[str, dict[str, Endpoint]] = {}
+    for method, path, role, handle, _ in table:
+        handlers.setdefault(path, {})[method] = _checked(role, handle, PARAMETERS.get((method, path), ()))
+    routes = [Route(path, _by_method(each), methods=list(each)) for path, each in handlers.items()]
     if page is not None:
         routes += [Route(f"/page/{name}", page.file, methods=["GET"]) for name in (*FILES, "three.js")]
-    handlers = dict.fromkeys((BusError, Refused, ScenarioError, HTTPException, Exception), error_response)
+    errors = dict.fromkeys((BusError, Refused, ScenarioError, HTTPException, Exception), error_response)
     access = Middleware(AccessCheck, tokens=tokens, page=page is not None)
-    return Starlette(routes=routes, exception_handlers=handlers, middleware=[access])
+    return Starlette(routes=routes, exception_handlers=errors, middleware=[access])
 
 
 class EventStream(StreamingResponse):
@@ -501,10 +513,23 @@ class EventStream(StreamingResponse):
         return f"id: {self._boot}-{entry.number}\nevent: {entry.topic}\ndata: {data}\n\n"
 
 
-def _checked(needed: Role, handle: Endpoint) -> Endpoint:
-    """The handler of a request that needs a role."""
+def _by_method(handlers: Mapping[str, Endpoint]) -> Endpoint:
+    """The handler of all requests of a path."""
+
+    async def handle(request: Request) -> Response:
+        return await handlers["GET" if request.method == "HEAD" else request.method](request)
+
+    return handle
+
+
+def _checked(needed: Role, handle: Endpoint, parameters: Sequence[str]) -> Endpoint:
+    """The handler of a request that needs a role, and may have these query parameters."""
 
     async def check(request: Request) -> Response:
+        if unknown := [name for name in request.query_params if name not in parameters]:
+            allowed = f"Parameters: {', '.join(parameters)}." if parameters else "It has none."
+            detail = f"There is no parameter '{unknown[0][:64]}' of this request. {allowed}"
+            raise HTTPException(HTTPStatus.UNPROCESSABLE_ENTITY, detail)
         role: Role = request.scope["role"]
         if ROLES.index(role) < ROLES.index(needed):
             raise HTTPException(HTTPStatus.FORBIDDEN, f"This token has the role {role}; this request needs {needed}.")

@@ -7,7 +7,7 @@ and messages that are lost. `order_events` turns it into a sequence that a sched
 import json
 import math
 from collections import Counter, defaultdict, deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -109,7 +109,7 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
         events=events,
         jobs=jobs,
         notices=(*map(_request_notice, operations.to_pylist()), *_alarm_notices(alarms, arms, jobs)),
-        halts=tuple(_halts(alarms, operations, results["time_s"].to_pylist())),
+        halts=tuple(_halts(alarms, operations, results["time_s"].to_pylist(), arms)),
         ended_s=min((row["time_s"] for row in results.to_pylist() if row["shift_ended"]), default=math.inf),
         offers=tuple(offer for row in results.to_pylist() for offer in offers_of(row)),
         model=model,
@@ -396,7 +396,9 @@ def _request_notice(row: Mapping[str, Any]) -> Notice:
         details.append("no due date" if action["due_s"] is None else f"due at {clock(action['due_s'])}")
     details += [f"value {action['value']:g}"] if "value" in action else []
     arm = "all arms" if row["arm"] == ALL_ARMS else row["arm"]
-    reason = ", ".join((*details, f"by {row['by'] or 'nobody named'}"))
+    details.append(f"by {row['by'] or 'nobody named'}")
+    note = f" ({row['note']})" if row["note"] else ""
+    reason = f"{', '.join(details)}{note}"
     return Notice(time_s=row["time_s"], kind=row["action"], arm=arm, job=row["job"], reason=reason)
 
 
@@ -419,15 +421,20 @@ def _alarm_notices(alarms: Sequence[Alarm], arms: Sequence[str], jobs: Sequence[
                 yield Notice(time_s=time_s, kind=kind, arm=arm, job=job, reason=reason)
 
 
-def _halts(alarms: Sequence[Alarm], operations: pa.Table, results_s: Sequence[float]) -> Iterator[Halt]:
-    """When nobody replied about the jobs, and when arms were paused.
+def _halts(
+    alarms: Sequence[Alarm], operations: pa.Table, results_s: Sequence[float], arms: Container[str]
+) -> Iterator[Halt]:
+    """When nobody replied about the jobs or awarded them, and when arms were paused.
 
     Args:
         results_s: Times of the results, ascending: the next one ends an alarm whose gateway has exited.
     """
-    for alarm in {(alarm.alarm, alarm.began_s): alarm for alarm in alarms if alarm.kind == "silent"}.values():
+    kinds = {"silent": "did not reply", "stopped": "awarded no jobs"}
+    for alarm in {(alarm.alarm, alarm.began_s): alarm for alarm in alarms if alarm.kind in kinds}.values():
         end_s = next((s for s in results_s if s > alarm.time_s), math.inf) if alarm.ended_s is None else alarm.ended_s
-        yield Halt(arm="", start_s=alarm.began_s, end_s=end_s, reason=f"{alarm.subject} did not reply")
+        reason = f"{alarm.subject} {kinds[alarm.kind]}" if alarm.subject else "nobody replied"
+        one = alarm.subject if alarm.kind == "stopped" and alarm.subject in arms else ""  # it allocates with its peers
+        yield Halt(arm=one, start_s=alarm.began_s, end_s=end_s, reason=reason)
     paused: dict[str, Halt] = {}
     for row in operations.to_pylist():
         arm = "" if row["arm"] == ALL_ARMS else row["arm"]

@@ -28,6 +28,7 @@ from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.operator import (
     ALL_ARMS,
     Action,
+    Clear,
     Cleared,
     ClearRequest,
     Controlled,
@@ -287,7 +288,7 @@ def control(actions: Sequence[Action], by: str, endpoint: str, fleet: str) -> No
 def _describe(action: Action, reply: Controlled) -> str:
     """One line about the outcome of an action."""
     note = f" {reply.note}" if reply.note else ""
-    if isinstance(action, Pause | Resume):
+    if isinstance(action, Pause | Resume | Clear):
         arms = ", ".join("all arms" if arm == ALL_ARMS else arm for arm in sorted(reply.paused))
         return f"Paused: {arms or 'none'}.{note}"
     job = reply.job

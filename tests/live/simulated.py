@@ -106,10 +106,10 @@ class SimulatedFleet(Fleet):
         self.submitter.accepted.update({job.name: job for job in jobs if job.name in accepted})
         return reply.jobs
 
-    def control(self, action: Action, name: str = "") -> Controlled:
+    def control(self, action: Action, name: str = "", by: str = "ann") -> Controlled:
         """Request what a person may; the request has a new name unless one is given."""
         self._requests += 1
-        request = ControlRequest(name or f"request {self._requests}", action, "ann")
+        request = ControlRequest(name or f"request {self._requests}", action, by)
         return self.ask(keys.of_jobs("f", "control"), request, Controlled)
 
     def free_space(self, arm: str) -> Cleared:

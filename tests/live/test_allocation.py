@@ -22,7 +22,7 @@ from fleet.bus.protocol.auction import (
     Status,
     StatusRequest,
 )
-from fleet.bus.protocol.operator import ALL_ARMS, Pause, Resume, Settle
+from fleet.bus.protocol.operator import ALL_ARMS, Clear, Operation, Pause, Resume, Settle
 from fleet.job import reason_to_give_up
 from fleet.live.auction.rounds import Assignment
 from fleet.live.leases import Timing
@@ -244,8 +244,11 @@ def test_the_space_of_an_arm_lost_in_its_last_cycle_stays_taken(fleet_of, alone)
     fleet.run(20.0)
     assert (fleet.status("a").state, fleet.status("b").state) == ("unfinished", "waiting")
     fleet.move_home(arm)
-    fleet.free_space(arm)
+    for _ in range(2):
+        fleet.free_space(arm)
     fleet.until(lambda: fleet.status("b").state == "finished")
+    (freed,) = (each for each in fleet.messages(Operation) if isinstance(each.request.action, Clear))
+    assert (freed.request.action.arm, freed.request.by, freed.note) == (arm, "ann", "")
     assert fleet.status("a").state == "unfinished"
 
 
@@ -273,12 +276,11 @@ def test_an_arm_that_is_online_again_after_it_was_cleared_takes_its_space_until_
     fleet.until(lambda: fleet.is_everywhere("a", "finished") and fleet.is_everywhere("b", "finished"))
 
 
-def test_only_space_that_is_taken_can_be_cleared(fleet_of, alone):
+def test_the_space_of_an_arm_that_is_not_known_cannot_be_cleared(fleet_of, alone):
     fleet = fleet_of(alone, excludes=always)
     reason = refused(lambda: fleet.free_space("arm_7"))
-    assert reason.endswith("Arms: arm_0, arm_1, arm_2." if alone else "'arm_7' takes no space. No arm does.") or (
-        "Arms that do" in reason
-    )
+    assert reason.startswith("'arm_7' is no arm of this fleet." if alone else "There is no arm 'arm_7'.")
+    assert reason.endswith("Arms: arm_0, arm_1, arm_2.")
 
 
 # Rounds of an auctioneer

@@ -264,7 +264,7 @@ def test_a_stopped_arm_returns_its_job_as_sure(bus):
     arm.node.retire(time.monotonic())
     bus.serve(lambda: auctioneer.reports)
     (report,) = auctioneer.reports
-    assert (report.outcome, report.unsure, report.reason) == ("returned", False, "the arm was stopped")
+    assert (report.outcome, report.unsure, report.reason) == ("returned", False, "The arm was stopped.")
     bus.serve(lambda: not arm.node.executor.has_pending_reports)
     again = bus.ask(line, "quote", request(), Quote)
     assert again.capacity == 0

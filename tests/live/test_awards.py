@@ -223,7 +223,7 @@ def test_a_job_without_a_lease_for_long_is_returned():
     assert executor.active, "a cycle is in progress"
     executor.return_ended(2.0, 26.0, at_home=True)
     ((_, report),) = executor.due_reports(26.0)
-    assert (report.outcome, report.time_s, report.reason) == ("returned", 2.0, "no lease for 20 s")
+    assert (report.outcome, report.time_s, report.reason) == ("returned", 2.0, "It had no lease for 20 s.")
 
 
 def test_a_lease_request_has_no_more_cycles_than_are_on_disk():

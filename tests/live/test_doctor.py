@@ -62,7 +62,7 @@ def faults(now, *probes, **more):
         ({"arm_0": 90.0, "arm_1": 2.0}, True, ""),
         ({"au": 60.0}, False, ""),
     ],
-    ids=["hung", "in time", "never heard", "no arm replies", "another arm replies", "all have left"],
+    ids=["hung", "in time", "not heard yet", "no arm replies", "another arm replies", "all have left"],
 )
 def test_a_fleet_in_which_nobody_replies_about_jobs_raises_an_alarm(ages_s, present, silent):
     auctioneers = tuple(AuctioneerSnapshot(name, True, age_s) for name, age_s in ages_s.items())

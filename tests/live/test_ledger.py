@@ -194,6 +194,13 @@ def test_a_quote_says_nothing_about_an_award_that_was_closed_after_the_request(b
     assert changes(closed_space(book)) == [SpaceTaken("arm_0", (), 3.0)]
 
 
+def test_a_job_whose_hard_due_date_has_passed_is_accepted_with_the_reason_why_it_is_given_up():
+    late, soft = spec("late", due_s=5.0, expires=True), spec("soft", due_s=5.0)
+    for time_s, reason in ((6.0, "Its hard due date has passed, so it is given up."), (4.0, "")):
+        admissions = admit([late, soft], {}, time_s=time_s)
+        assert [(each.accepted, each.reason) for each in admissions] == [(True, reason), (True, "")]
+
+
 def test_after_the_end_of_the_shift_no_job_is_ready():
     book = ledger(spec("a"), spec("b", place="bin"), spec("c", place="belt"))
     book.apply(award("a"))
@@ -202,7 +209,7 @@ def test_after_the_end_of_the_shift_no_job_is_ready():
     book.apply(ShiftEnded(7200.0))
     assert {s.job: s.state for s in book.status()} == {"a": "unfinished", "b": "finished", "c": "unfinished"}
     assert book.ready(9999.0, 9) == []
-    assert "shift is over" in book.admit([spec("d")])[0].reason
+    assert "shift is over" in book.admit([spec("d")], 0.0)[0].reason
     book.apply(closed("0:a", "finished", 4, 7201.0))
     assert book.status(["a", "unknown"])[0].state == "finished"
 
@@ -344,12 +351,12 @@ def test_settled_jobs_leave_and_their_names_are_known(monkeypatch):
         assert list(each.jobs) == ["job 7", "job 8", "next", "waits"]
         assert each.left == {"finished": 6, "given_up": 1}
         assert names(each.ready(9.0, 9)) == list(each.waiting) == ["next", "waits"]
-        same, other, forgotten = each.admit([spec("job 3", due_s=3.0), spec("job 5", value=2.0), spec("job 2")])
+        same, other, forgotten = each.admit([spec("job 3", due_s=3.0), spec("job 5", value=2.0), spec("job 2")], 0.0)
         assert (same.accepted, other.accepted, forgotten.accepted) == (True, False, True)
         assert same.reason == "It was finished long ago, and is not done again; the recording has its result."
         assert other.reason == "Another job has the name 'job 5'; names must be unique."
         assert forgotten.reason == ""
-        late, after = each.admit([spec("late", "job 4"), spec("after", "job 5")])
+        late, after = each.admit([spec("late", "job 4"), spec("after", "job 5")], 0.0)
         assert late.reason == "Given up, because it waits for 'job 4', which is given up or cancelled."
         assert after.reason == ""
         assert each.apply(JobsAccepted((spec("job 3"),))) == []
@@ -427,7 +434,7 @@ def test_jobs_that_wait_for_a_job_that_is_given_up_are_given_up_until_that_one_i
         book.apply(award("j", number, "a"))
         changes = book.apply(end(number, "a", "returned", float(number), faulted=True))
     assert [(change.status.job, change.status.state) for change in changes] == [("j", "given_up"), ("k", "given_up")]
-    (admission,) = book.admit((last,))
+    (admission,) = book.admit((last,), 0.0)
     assert (admission.accepted, admission.reason) == (True, LOST.replace("'j'", "'k'"))
     (change,) = book.apply(JobsAccepted((last,), "test", 3.0))
     assert (change.status.state, change.status.reason) == ("given_up", admission.reason)

@@ -135,6 +135,12 @@ def test_a_paused_arm_gives_its_job_back_and_gets_none_until_it_is_resumed(fleet
     fleet.until(lambda: fleet.status("a").cycles > 3)
     arm = fleet.holder("a")
     assert fleet.control(Pause(arm)).paused == {arm: "ann"}
+    second = fleet.control(Pause(arm), by="bob")
+    assert (second.changed, second.paused) == (False, {arm: "bob" if fleet.alone else "ann"})
+    before = "It was paused by 'ann' before; the latest" if fleet.alone else "Nothing changed: it is paused by 'ann'"
+    assert second.note.startswith(before)
+    assert [each.note for each in fleet.messages(Operation)] == ["", second.note]
+    fleet.control(Pause(arm))
     fleet.restart(*(() if not fleet.alone else fleet.arms[-1:]))
     fleet.until(lambda: fleet.holder("a") not in ("", arm))
     last = fleet.holder("a")

@@ -371,6 +371,8 @@ class Status(msgspec.Struct, frozen=True):
     """As in `Clock`."""
     paused: dict[Name, str] = {}
     """Who paused an arm, by arm; "*" for all arms."""
+    trouble: str = ""
+    """Why its sender accepts and awards no jobs, for example a full disk; "" if it does."""
 
 
 class Announcement(msgspec.Struct, frozen=True):

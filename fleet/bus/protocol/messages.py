@@ -5,11 +5,13 @@ writer would silently turn them into `null`), an unknown score is `null`. Unknow
 may add some; a change that a reader of this version could misread takes a new version in the schema name.
 """
 
+from collections.abc import Iterable, Iterator
 from functools import cache
 from math import isfinite
 from typing import Annotated, TypeVar
 
 import msgspec
+from msgspec import inspect
 
 from fleet.errors import BusError
 from fleet.telemetry import Mode
@@ -217,7 +219,38 @@ def decode(kind: type[Message], payload: bytes, sent_encoding: str | None = None
     try:
         return _decoder(kind).decode(payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise MalformedMessage(f"Not a {schema(kind)}: {error}") from error
+        raise MalformedMessage(f"Not a {schema(kind)}: {error}{_allowed(kind, str(error))}") from error
+
+
+def _allowed(kind: type, error: str) -> str:
+    """The values that are allowed where an error of decoding found another one; "" for errors of other kinds."""
+    _, _, path = error.partition(" - at `$.")
+    if not (error.startswith("Invalid ") and path):
+        return ""
+    at: list[inspect.Type] = [inspect.type_info(kind)]
+    for name in path.rstrip("`").split("."):
+        name, _, of_list = name.partition("[")
+        structs = [each for each in _alternatives(at) if isinstance(each, inspect.StructType)]
+        tags = [each.tag for each in structs if each.tag_field == name]
+        if tags:
+            return f". Allowed: {', '.join(sorted(map(str, tags)))}"
+        at = [field.type for each in structs for field in each.fields if field.encode_name == name]
+        if of_list:
+            lists = [each for each in _alternatives(at) if isinstance(each, inspect.VarTupleType | inspect.DictType)]
+            at = [each.value_type if isinstance(each, inspect.DictType) else each.item_type for each in lists]
+    values = [value for each in _alternatives(at) if isinstance(each, inspect.LiteralType) for value in each.values]
+    return f". Allowed: {', '.join(sorted(map(str, values)))}" if values else ""
+
+
+def _alternatives(types: Iterable[inspect.Type]) -> Iterator[inspect.Type]:
+    """The types themselves, with those of unions one by one, and without their limits."""
+    for each in types:
+        if isinstance(each, inspect.UnionType):
+            yield from _alternatives(each.types)
+        elif isinstance(each, inspect.Metadata):
+            yield from _alternatives([each.type])
+        else:
+            yield each
 
 
 def check_name(message: msgspec.Struct, name: str, field: str) -> None:

@@ -7,7 +7,14 @@ import msgspec
 from fleet.bus.protocol.auction import JobStatus
 from fleet.bus.protocol.messages import Count, FiniteStruct, Name, Number, Person
 
+MAX_REQUEST_NAME = 64
+"""Characters of the name of a request."""
 JobName = Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
+
+
+def by_whom(by: str) -> str:
+    """Return ` by 'NAME'`; "" for nobody named."""
+    return f" by '{by}'" if by else ""
 
 
 class ClearRequest(msgspec.Struct, frozen=True):
@@ -75,13 +82,19 @@ class Resume(msgspec.Struct, frozen=True, tag_field="action", tag="resume"):
     """"*" ends all pauses."""
 
 
-Action = Cancel | Settle | Change | Pause | Resume
+class Clear(msgspec.Struct, frozen=True, tag_field="action", tag="clear"):
+    """The space of an absent arm was freed. Only in an `Operation`: it is requested by a `ClearRequest`."""
+
+    arm: Name
+
+
+Action = Cancel | Settle | Change | Pause | Resume | Clear
 
 
 class ControlRequest(msgspec.Struct, frozen=True):
     """Request to `jobs/control`: steer jobs and arms. It is idempotent."""
 
-    request: Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
+    request: Annotated[str, msgspec.Meta(min_length=1, max_length=MAX_REQUEST_NAME)]
     """Unique name of this request, for example a UUID; the last 1024 are kept, across restarts. A repeated request gets
     a reply and changes nothing; a different one of the same name is refused."""
     action: Action
@@ -123,7 +136,10 @@ class ResetReply(msgspec.Struct, frozen=True):
 
 class Operation(FiniteStruct, frozen=True):
     """Published under `auction/{auctioneer}/operation`, without an auctioneer under `arm/{arm}/operation`: an operator
-    request was carried out, even if it changed nothing. A repeated request is not published."""
+    request was carried out, even if it changed nothing. A repeated request is not published.
+
+    A freed space is published likewise, as a request with the action `clear`.
+    """
 
     auctioneer: Name
     """Without an auctioneer, the arm that replied."""
@@ -135,6 +151,8 @@ class Operation(FiniteStruct, frozen=True):
     """As in `Clock`: `number` restarts with a new epoch."""
     awards: Annotated[tuple[Name, ...], msgspec.Meta(max_length=16)] = ()
     """With `redo`, without an auctioneer: the awards of the job whose last cycle was not done."""
+    note: str = ""
+    """Why it changed nothing; "" if it did."""
 
 
 ALARMS_PER_START = 100_000

@@ -44,7 +44,7 @@ from fleet.live.journal import CommitPermitted, JournalState, Progress, Released
 
 MAX_PAST_AWARDS = 256
 """Closed awards whose answer is kept; their quotes expired long ago."""
-REVOKED = "the award was revoked"
+REVOKED = "The award was revoked."
 """Why an award is returned that an auctioneer, or a person, has revoked."""
 
 
@@ -213,12 +213,17 @@ class ArmHistory(JournalState[ArmRecord]):
         accepted = bounded(self.accepted, reports)
         return ArmHistory(self.boot + 1, {}, reports, accepted, self.epoch, dict(self.finished), arm)
 
-    def message(self, arm: str) -> History:
-        """Return what the arm has done and has, as much as fits into one message."""
+    def message(self, arm: str, time_s: float = 0.0) -> History:
+        """Return what the arm has done and has, as much as fits into one message.
+
+        Args:
+            time_s: Fleet time by its clock; 0 for unknown.
+        """
         active = list(self.active.values())[:MOST_JOBS]
         awards = tuple(replace(each.award, cycles=each.cycles) for each in active)
         may_commit = tuple(each.award.award for each in active if each.may_commit)
-        return with_finished(History(arm, self.epoch, (), awards, may_commit), list(self.finished.values()))
+        history = History(arm, self.epoch, (), awards, may_commit, time_s=time_s)
+        return with_finished(history, list(self.finished.values()))
 
 
 def bounded(accepted: dict[str, str], needed: Iterable[str]) -> dict[str, str]:
@@ -481,7 +486,7 @@ class AwardExecutor:
             unleased_s = now_s - active.lease_end_s
             expired = not active.may_commit and unleased_s > self.config.return_after_s
             if (active.revoked or expired) and (at_home or active is not self._current):
-                reason = active.why if active.revoked else f"no lease for {unleased_s:.0f} s"
+                reason = active.why if active.revoked else f"It had no lease for {unleased_s:.0f} s."
                 self._close(active, "returned", time_s, now_s, reason)
 
     def _close(

@@ -47,10 +47,10 @@ from fleet.bus.protocol.auction import (
     Receipt,
     Report,
 )
-from fleet.bus.protocol.consensus import HistoryRequest
+from fleet.bus.protocol.consensus import History, HistoryRequest
 from fleet.bus.protocol.keys import STATE_HZ
 from fleet.bus.protocol.messages import DifficultyScores, Info, State
-from fleet.bus.protocol.operator import ResetReply, ResetRequest
+from fleet.bus.protocol.operator import ResetReply, ResetRequest, by_whom
 from fleet.difficulty import known_temperatures
 from fleet.errors import BusError, Refused, RefusedForNow, printable
 from fleet.events import EVENTS_PER_BOOT, Event
@@ -243,6 +243,9 @@ class ClockSync:
         clock: Returns the clock.
         set_clock: Replaces it; the second argument is whether it reads another time now.
         warn: Logs a warning of a kind.
+
+    Attributes:
+        is_set: Whether the clock has been set to fleet time.
     """
 
     def __init__(
@@ -253,16 +256,16 @@ class ClockSync:
         warn: Callable[[str, str], None],
     ) -> None:
         self._link, self._clock, self._set_clock, self._warn = link, clock, set_clock, warn
-        self._asked_s, self._is_set, self._asking = -math.inf, False, False
+        self._asked_s, self.is_set, self._asking = -math.inf, False, False
 
     def ask_first(self, real_s: float) -> None:
         """Request the fleet time now, unless it is known: an award may follow, whose event has a time."""
-        if not (self._is_set or self._asking):
+        if not (self.is_set or self._asking):
             self._ask(real_s)
 
     def step(self, real_s: float) -> None:
         """Request the fleet time, when that is due."""
-        if real_s >= self._asked_s + CLOCK_S[self._is_set]:
+        if real_s >= self._asked_s + CLOCK_S[self.is_set]:
             self._ask(real_s)
 
     def _ask(self, real_s: float) -> None:
@@ -285,8 +288,8 @@ class ClockSync:
         if reply.speed != clock.speed:
             clock = FleetClock(reply.speed, answered_s, clock.now_s(answered_s))
         clock = replace(clock, epoch=reply.epoch)
-        set_to, jump = (clock.slewed_to, False) if self._is_set else (clock.set_to, True)
-        self._is_set = True
+        set_to, jump = (clock.slewed_to, False) if self.is_set else (clock.set_to, True)
+        self.is_set = True
         self._set_clock(set_to(asked_s, answered_s, reply.time_s), jump)
 
 
@@ -360,14 +363,19 @@ class AuctioneerClient:
         Args:
             history: The awards of the arm on its disk, now and later: auctioneers ask for it.
         """
-        self._link, self._executor = arm.link, arm.executor
-        if history is not None:
-            link, fleet, name = arm.link, arm.link.fleet, arm.executor.arm
-            link.reply_to(keys.of_arm(fleet, name, "history"), HistoryRequest, lambda _: history.message(name))
-        self._warn = RateLimitedWarnings(arm.executor.arm)
+        link, name = arm.link, arm.executor.arm
+        self._link, self._executor = link, arm.executor
+        self._warn = RateLimitedWarnings(name)
         self._clock = ClockSync(
-            arm.link, lambda: arm.clock, lambda clock, jump: arm.set_clock(clock, jump=jump), self._warn
+            link, lambda: arm.clock, lambda clock, jump: arm.set_clock(clock, jump=jump), self._warn
         )
+        if history is not None:
+
+            def reply(_: HistoryRequest) -> History:
+                known = self._clock.is_set and arm.clock.epoch == history.epoch
+                return history.message(name, arm.clock.now_s(time.monotonic()) if known else 0.0)
+
+            link.reply_to(keys.of_arm(link.fleet, name, "history"), HistoryRequest, reply)
 
     def request_leases(self, auctioneer: str, request: LeaseRequest, asked_s: float) -> None:
         """Send a lease request to its auctioneer."""
@@ -468,7 +476,7 @@ class ArmNode:
         At the latest it ends when `time.monotonic()` is `until_s`.
         """
         self._config = replace(self._config, takes_jobs=False)
-        self.executor.return_all(self._body.time_s, time.monotonic(), "the arm was stopped")
+        self.executor.return_all(self._body.time_s, time.monotonic(), "The arm was stopped.")
         reported_s = time.monotonic() if self.executor.has_pending_reports else -math.inf
         while time.monotonic() < until_s:
             if self.executor.has_pending_reports:
@@ -683,7 +691,7 @@ class ArmNode:
             self._body.start(self._estimator.job(current.award.job), self._scored(current.award).plan, current.cycles)
         except ValueError as error:
             self._warn("start", f"returns '{printable(current.job)}', which it cannot start: {error}")
-            self.executor.return_all(self._body.time_s, time.monotonic(), f"it cannot be started: {error}")
+            self.executor.return_all(self._body.time_s, time.monotonic(), f"It cannot be started: {error}")
         else:
             self._body_award = name
 
@@ -700,7 +708,7 @@ class ArmNode:
         for event in self._body.advance(until_s):
             self._handle_event(event, real_s)
         if self._reading.mode == "faulted" and self.executor.active:
-            self.executor.return_all(self._body.time_s, real_s, "the arm is faulted")
+            self.executor.return_all(self._body.time_s, real_s, "The arm is faulted.")
             self._body_award = ""
         self._estimator.heat_ratio, _ = self._body.found
         if current := self._current:
@@ -730,10 +738,10 @@ class ArmNode:
         elif event.kind == "return":
             self._body_award = ""
             self.executor.record_progress(int(event.value), math.inf)
-            self.executor.return_all(event.time_s, real_s, f"the arm faulted; {event.reason}", faulted=True)
+            self.executor.return_all(event.time_s, real_s, f"The arm faulted: {event.reason}", faulted=True)
             self._reading = self._body.read_sensors()  # the next estimates take the fault into account
         elif event.kind == "recover" and self._cleared_by is not None:
-            event, self._cleared_by = replace(event, reason=f"cleared by '{self._cleared_by}'"), None
+            event, self._cleared_by = replace(event, reason=f"cleared{by_whom(self._cleared_by)}"), None
         self._publish.event(event, self.clock.epoch)
 
     def _busy_s(self) -> float:

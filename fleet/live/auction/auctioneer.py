@@ -83,7 +83,7 @@ class Auctioneer:
 
     def submit(self, submission: Submission, real_s: float, time_s: float) -> SubmissionReply:
         """Accept jobs; every accepted one is on disk when this returns."""
-        admissions = self.book.admit(submission.jobs)
+        admissions = self.book.admit(submission.jobs, time_s)
         accepted = {job.name: job for job, reply in zip(submission.jobs, admissions, strict=True) if reply.accepted}
         new = tuple(j for name, j in accepted.items() if name not in self.book.jobs and name not in self.book.past)
         if new:
@@ -202,11 +202,11 @@ class Auctioneer:
         job = requested_job(request)
         return controlled(self.book, request, note, next(iter(self.status((job,))), None) if job else None)
 
-    def set_present(self, present: frozenset[str]) -> None:
-        """Set which arms are present."""
+    def set_present(self, present: frozenset[str], obstacle: str = "") -> None:
+        """Set which arms are present, and why no job is awarded; "" if jobs are."""
         if present - self.rounds.present:
             self.rounds.retry_now()
-        self.rounds.present = present
+        self.rounds.present, self.rounds.obstacle = present, obstacle
 
     def tick(self, real_s: float, time_s: float) -> None:
         """Do what is due."""

@@ -36,7 +36,7 @@ from fleet.live.auction.rounds import SCAN_S, Allocate
 from fleet.live.book import JobBook
 from fleet.live.clock import FleetClock
 from fleet.live.desk import JobDesk
-from fleet.live.epochs import REMEDY, REPLY_S, ask_arms, check_begin, describe
+from fleet.live.epochs import REMEDY, REPLY_S, ask_arms, check_begin, describe, kept_time_s
 from fleet.live.journal import EpochBegun, Journal, Started, TimeRecorder, own_records
 from fleet.live.leases import Timing
 from fleet.live.monitor.snapshot import FRESH_S
@@ -166,11 +166,12 @@ class AuctionNode(JobDesk):
         self._timing = timing or Timing()
         self._check_no_auctioneer()
         book = self.book = JobBook(places, arms).replay(own_records(journal, name))
+        histories = ask_arms(link)
         if not (book.epoch or new_epoch):
-            check_begin(link.fleet, ask_arms(link))
+            check_begin(link.fleet, histories)
         real_s = time.monotonic()
         self._recorder = TimeRecorder(journal, book, real_s)
-        start_s = self._recorder.start_s(speed)
+        start_s = max(self._recorder.start_s(speed), kept_time_s(histories, book.epoch))
         self._clock = FleetClock(speed, real_s, start_s)
         epoch = () if book.epoch else (EpochBegun(secrets.token_hex(4), start_s, succeeds=new_epoch),)
         begun = (Started(name, start_s), *epoch)
@@ -221,7 +222,8 @@ class AuctionNode(JobDesk):
         if real_s >= self._check_s:
             self._check_rivals(real_s)
         alone = not self.rivals and real_s - self._alone_s < ALONE_S
-        self.auctioneer.set_present(self._epochs.admitted(self.present if alone else ()))
+        admitted = self._epochs.admitted(self.present if alone else ())
+        self.auctioneer.set_present(admitted, self._obstacle(admitted, alone))
         self.auctioneer.tick(real_s, time_s)
         self._recorder.step(real_s, time_s)
         self._send()
@@ -276,6 +278,24 @@ class AuctionNode(JobDesk):
     def _check_alone(self, vain: str) -> None:
         if self.rivals:
             raise RefusedForNow(f"{self._name_rivals()}: {vain} until one is stopped.")
+
+    def _obstacle(self, admitted: frozenset[str], alone: bool) -> str:
+        """Return why no job is awarded; "" if jobs are, or no arm is present."""
+        if admitted and not self._recorder.failure:
+            return ""
+        if trouble := self._trouble():
+            return trouble
+        if not alone:
+            return "It is being checked whether the fleet has another auctioneer."
+        waits = ", ".join(sorted(self.present))
+        return f"It is not known yet which jobs have been done by {waits}." if waits else ""
+
+    def _trouble(self) -> str:
+        if self.rivals:
+            return f"{self._name_rivals()}: no jobs are accepted or awarded until one is stopped."
+        if self._recorder.failure:
+            return f"No jobs are accepted or awarded: {self._recorder.failure}"
+        return self._epochs.objection
 
     def _submit(self, submission: Submission) -> SubmissionReply:
         self._check_alone("no jobs are accepted")

@@ -30,7 +30,7 @@ from fleet.bus.protocol.auction import (
     Result,
 )
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import ALL_ARMS, Operation
+from fleet.bus.protocol.operator import ALL_ARMS, Operation, by_whom
 from fleet.errors import JournalFull
 from fleet.live.book import JobBook
 from fleet.live.job_rules import why_not_ready
@@ -393,6 +393,7 @@ class Rounds:
         states: The last state of each arm, with its last possible temperatures.
         sensors: The motor sensors of each arm.
         present: Arms that are present.
+        obstacle: Why no job is awarded; "" if jobs are.
     """
 
     def __init__(
@@ -410,6 +411,7 @@ class Rounds:
         self.states: dict[str, State] = {}
         self.sensors: defaultdict[str, ArmSensors] = defaultdict(ArmSensors)
         self.present: frozenset[str] = frozenset()
+        self.obstacle = ""
         self._name, self._book, self.allocate, self._send = name, book, allocate, send
         self._timing, self._excludes, self._boot = timing, excludes, boot
         self._count = 0
@@ -445,8 +447,10 @@ class Rounds:
             busy: Stations at which an arm may be at work.
         """
         book = self._book
+        if self.obstacle:
+            return self.obstacle
         if (pauser := book.operations.paused.get(ALL_ARMS)) is not None:
-            return f"All arms are paused by '{pauser}'."
+            return f"All arms are paused{by_whom(pauser)}."
         if not self.present:
             return "No arm is present."
         if all(map(book.is_paused, self.present)):
@@ -572,7 +576,7 @@ class Rounds:
         paused = self._book.operations.paused
         if arm not in self.present:
             return "is not present"
-        return f"is paused by '{paused[arm]}'" if arm in paused else "has not answered in time"
+        return f"is paused{by_whom(paused[arm])}" if arm in paused else "has not answered in time"
 
     def _may_work(self, arm: str, closing: Round) -> bool:
         return arm in closing.asked & self.present and not self._book.is_paused(arm)

@@ -110,7 +110,7 @@ class Granter:
                 granted.append(GrantedEntry(entry.award, job.cycles, may_commit, dict(job.faults)))
         return ClaimReply(self.arm, claim.number, self.timing.lease_s, tuple(granted), tuple(denied))
 
-    def clear(self, arm: str, by: str, present: frozenset[str], real_s: float, time_s: float) -> None:
+    def clear(self, arm: str, by: str, present: frozenset[str], real_s: float, time_s: float) -> bool:
         """Free the space of an absent arm and revoke its grants, as `clear`.
 
         Raises:
@@ -119,7 +119,7 @@ class Granter:
         if arm not in self.roster:
             raise Refused(f"'{arm}' is no arm of this fleet. Arms: {', '.join(sorted(self.roster))}.")
         expire(self.book, real_s, time_s)
-        clear(self.book, arm, by, present, self.timing.lease_s, time_s)
+        return clear(self.book, arm, by, present, self.timing.lease_s, time_s)
 
     def in_the_way(self, arm: str, space: str | None) -> tuple[str, ...]:
         """Return the arms that take a space which excludes this one of an arm."""

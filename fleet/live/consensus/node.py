@@ -311,23 +311,29 @@ class ConsensusNode(JobDesk):
         """Fleet time."""
         return self._arm.clock.now_s(time.monotonic())
 
+    def _trouble(self) -> str:
+        failure = self._recorder.failure
+        return f"{self._name} accepts and takes no jobs: {failure}" if failure else ""
+
     def _statuses(self, names: tuple[str, ...]) -> list[JobStatus]:
         return [status for status in self.statuses() if not names or status.job in names]
 
     def _submit(self, submission: Submission) -> SubmissionReply:
         later = {job.name: job for _, job in self._stream}
-        admissions = self.book.admit(submission.jobs, later)
+        admissions = self.book.admit(submission.jobs, self.time_s, later)
         accepted = [job for job, reply in zip(submission.jobs, admissions, strict=True) if reply.accepted]
         self.participant.granter.add_jobs(accepted, submission.by)
         self._check_first()
         return SubmissionReply(self._name, admissions, self._epoch)
 
     def _clear(self, request: ClearRequest) -> Cleared:
-        present = frozenset(self._tokens | {self._name})
+        present, freed = frozenset(self._tokens | {self._name}), False
         try:
-            self.participant.granter.clear(request.arm, request.by, present, time.monotonic(), self.time_s)
+            freed = self.participant.granter.clear(request.arm, request.by, present, time.monotonic(), self.time_s)
         finally:
             self._check_first()
+        if freed:
+            self.participant.out.append(self.book.requested[-1])
         return Cleared(self._name, request.arm)
 
     def _control(self, request: ControlRequest) -> Controlled:

@@ -25,7 +25,7 @@ from fleet.bus.protocol.auction import NOT_PLANNED, SETTLED, JobSpec, JobStatus,
 from fleet.bus.protocol.cell import Cell
 from fleet.bus.protocol.consensus import Bid, Claim
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import ALL_ARMS, Controlled, ControlRequest, Operation
+from fleet.bus.protocol.operator import ALL_ARMS, Controlled, ControlRequest, Operation, by_whom
 from fleet.live.arm.node import ArmNode
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.rounds import NOT_OFFERED, Bidding, Choice, no_arm_can, reason_to_wait, resolve_claims
@@ -280,7 +280,7 @@ class Participant:
     def _refusal(self, job: str) -> str:
         """Return why no present arm can do a job, or none works; "" if one can, or it is unknown."""
         if (pauser := self.book.operations.paused.get(ALL_ARMS)) is not None:
-            return f"All arms are paused by '{pauser}'."
+            return f"All arms are paused{by_whom(pauser)}."
         reasons = self._refusals.get(job, {})
         unknown = not reasons or self._present - reasons.keys() or NOT_PLANNED in reasons.values()
         return "" if unknown or not all(reasons.values()) else no_arm_can(reasons)

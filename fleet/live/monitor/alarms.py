@@ -12,23 +12,25 @@ from fleet.errors import Refused
 from fleet.live.monitor.health import Finding
 from fleet.live.monitor.snapshot import MAX_ALARMS, STATUS_EVERY_S
 
-LASTING = {
-    "absent": "{} is absent: it has left, or its process hangs or has ended.",
-    "silent": "{} does not reply: its process hangs or has ended, and no job is awarded.",
-    "space": (
-        "The space of {} stays closed to other arms, as it is not present. "
-        "Clear it once a person has seen that it is at home or removed, and is switched off."
-    ),
-}
-"""Texts of alarms whose findings name a state of the moment, by kind."""
 HOLD_S = 5.0
 """Real seconds without the finding after which an alarm ends: a finding that comes and goes raises one alarm."""
-BEGIN_S = {"absent": 3.0, "space": 3.0, "silent": STATUS_EVERY_S + 1.0, "no_progress": 10.0}
+BEGIN_S = {
+    "absent": 3.0,
+    "space": 3.0,
+    "stopped": 3.0,
+    "connection": 3.0,
+    "silent": STATUS_EVERY_S + 1.0,
+    "no_progress": 10.0,
+}
 """Real seconds that a finding of these kinds must last before it raises an alarm: every arm is absent for a moment
 while the router restarts, an auctioneer is asked anew only after a longer outage, and reasons of jobs are some seconds
 old."""
-OF_FLEET = ("no_progress", "webhook")
-"""Kinds of alarms whose subject is neither arm nor job: they end with their finding, whoever is heard."""
+OF_FLEET = ("no_progress", "connection", "webhook")
+"""Kinds of alarms whose subject is neither participant nor job: they end with their finding, whoever is heard."""
+
+
+UNTIL_SEEN = ("given_up",)
+"""Kinds of alarms that end when somebody has acknowledged them: what they tell stays so for good."""
 
 
 def alarm_name(kind: str, subject: str) -> str:
@@ -103,9 +105,11 @@ class AlarmList:
             lasts_s, lasting = real_s - self._first_s[name], name in self.alarms and self.alarms[name].ended_s is None
             if not lasting and lasts_s < BEGIN_S.get(finding.kind, 0.0):
                 continue
+            if not lasting and finding.kind in UNTIL_SEEN and name in self.alarms and self.alarms[name].by:
+                continue
             self._found_s[name] = real_s
             if not lasting:
-                what = LASTING.get(finding.kind, finding.what).format(finding.subject)
+                what = finding.lasting or finding.what
                 began_s = max(0.0, time_s - speed * max(lasts_s, finding.since_s))
                 alarm = Alarm(self.monitor, 0, time_s, name, finding.kind, what, finding.subject, began_s)
                 changed.append(self._change(alarm, time_s))
@@ -140,7 +144,9 @@ class AlarmList:
         if alarm.by:
             raise Refused(f"'{alarm.by}' has acknowledged it at {alarm.acknowledged}.")
         at = now.astimezone(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
-        return self._change(replace(alarm, by=by.strip(), acknowledged=at), time_s)
+        ends = alarm.kind in UNTIL_SEEN and alarm.ended_s is None
+        ended_s = max(alarm.began_s, time_s) if ends else alarm.ended_s
+        return self._change(replace(alarm, by=by.strip(), acknowledged=at, ended_s=ended_s), time_s)
 
     def _change(self, alarm: Alarm, time_s: float) -> Alarm:
         self._number += 1

@@ -26,7 +26,7 @@ from fleet.bus.protocol.messages import encode
 from fleet.bus.protocol.operator import Alarm
 from fleet.errors import BusError, Refused
 from fleet.live.monitor.alarms import AlarmList
-from fleet.live.monitor.health import Finding, check_fleet
+from fleet.live.monitor.health import Finding, check_connection, check_fleet
 from fleet.live.monitor.snapshot import FRESH_S, MAX_JOBS, FleetListener, FleetSnapshot, Recent, Role
 
 _LOG = logging.getLogger(__name__)
@@ -139,6 +139,8 @@ class AsyncBridge:
         link.watch_tokens(keys.of_every(self.fleet, "monitor", "alive"), self._monitor)
         self._check_s = time.monotonic() + FRESH_S  # by then it has heard from everybody who is there
         self._earlier = deque[FleetSnapshot](maxlen=3)
+        self._known: list[Finding] = []
+        """Findings of the last check with a connection to the router."""
         self._told = {each.alarm: (each.ended_s is None, each.by) for each in self._alarms.alarms.values()}
         for alarm in self._alarms.alarms.values():
             self._publish(alarm)
@@ -196,6 +198,8 @@ class AsyncBridge:
     async def _query(self, key: str, request: msgspec.Struct, kind: type[Reply], timeout_s: float) -> Replies[Reply]:
         def query(done: Callable[[Replies[Reply] | BusError], None]) -> None:
             try:
+                if not self._link.connected:
+                    raise BusError("The connection to the router is lost: it has ended, or is unreachable.")
                 self._link.query(key, request, kind, done, timeout_s=timeout_s)
             except BusError as error:
                 done(error)
@@ -229,8 +233,12 @@ class AsyncBridge:
     def _check_alarms(self, real_s: float) -> None:
         """Begin and end alarms by what the fleet shows."""
         now = self._listener.view.snapshot(real_s)
-        findings = check_fleet(now, self._earlier[0] if len(self._earlier) == self._earlier.maxlen else None)
-        self._earlier.append(now)
+        if lost := check_connection(now):
+            self._earlier.clear()
+        else:
+            self._known = check_fleet(now, self._earlier[0] if len(self._earlier) == self._earlier.maxlen else None)
+            self._earlier.append(now)
+        findings = [*self._known, *lost]
         heard = {each.arm for each in now.arms} | {each.job for each in now.jobs}
         heard |= {each.auctioneer for each in now.auctioneers if each.heard_age_s is not None}
         findings += self._more_findings()

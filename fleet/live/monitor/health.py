@@ -11,7 +11,7 @@ from typing import Literal, get_args
 import msgspec
 
 from fleet.live.clock import FleetClock
-from fleet.live.monitor.snapshot import FRESH_S, STATUS_EVERY_S, ArmSnapshot, FleetSnapshot
+from fleet.live.monitor.snapshot import FRESH_S, SILENT_S, ArmSnapshot, FleetSnapshot
 
 REASONS = {
     "It is released at": "release", "It waits for": "predecessor", "are paused": "paused", "paused by": "paused",
@@ -27,13 +27,23 @@ EXPECTED = ("release", "predecessor", "paused", "queue", "break", "planning", "h
 """Classes of jobs that wait in order."""
 MOST_REASONS = 5
 NO_OFFSETS: Mapping[str, float] = {}
-SILENT_S = 3 * STATUS_EVERY_S
-"""Real seconds without a reply about the jobs, after which nobody allocates them."""
 OFFSET_S, SLOW_S = 1.0, 0.1
 """Real seconds: clock offsets and round trips above these are findings."""
 
 
-AlarmKind = Literal["fault", "sensor", "absent", "silent", "given_up", "unfinished", "no_progress", "space", "webhook"]
+AlarmKind = Literal[
+    "fault",
+    "sensor",
+    "absent",
+    "silent",
+    "stopped",
+    "connection",
+    "given_up",
+    "unfinished",
+    "no_progress",
+    "space",
+    "webhook",
+]
 ALARM_KINDS: tuple[AlarmKind, ...] = get_args(AlarmKind)
 
 
@@ -49,6 +59,8 @@ class Finding(msgspec.Struct, frozen=True):
     """Of the alarm, for example an arm or a job; it lasts while there is a finding of its kind and subject."""
     since_s: float = 0.0
     """Real seconds for which it has been so before it was found."""
+    lasting: str = ""
+    """Text of its alarm, if `what` names a state of the moment."""
 
 
 @dataclass(frozen=True)
@@ -148,24 +160,37 @@ def check_health(
 def check_fleet(
     fleet: FleetSnapshot, earlier: FleetSnapshot | None, offsets_s: Mapping[str, float] = NO_OFFSETS
 ) -> list[Finding]:
-    """What snapshots show of arms, jobs and space: the findings that raise alarms.
+    """What snapshots show of arms, jobs and space: the findings that raise alarms, except that of a lost connection.
 
     Args:
         earlier: As in `check_health`.
         offsets_s: As in a report, of the arms whose offset is to be checked.
     """
     arms = (finding for arm in fleet.arms for finding in check_arm(arm, offsets_s.get(arm.arm)))
-    return [*arms, *check_replies(fleet), *check_jobs(fleet), *check_progress(fleet, earlier), *check_space(fleet)]
+    return [*arms, *check_awards(fleet), *check_jobs(fleet), *check_progress(fleet, earlier), *check_space(fleet)]
 
 
-def check_replies(fleet: FleetSnapshot) -> list[Finding]:
-    """Check that somebody still replies about the jobs while arms are present: an auctioneer, or an arm without one."""
-    ages_s = {each.auctioneer: each.heard_age_s for each in fleet.auctioneers if each.heard_age_s is not None}
-    last = min(ages_s, key=lambda name: ages_s[name], default="")
-    if not last or ages_s[last] <= SILENT_S or not any(arm.present for arm in fleet.arms):
+def check_connection(fleet: FleetSnapshot) -> list[Finding]:
+    """Check that the listener has a connection to the router: without one a snapshot shows an earlier fleet."""
+    if fleet.lost_s is None:
         return []
-    silent = f"{last} has not replied for {ages_s[last]:.0f} s: its process hangs or has ended, and no job is awarded."
-    return [Finding("fault", silent, "silent", last, ages_s[last])]
+    lost = "The connection to the router is lost: the router has ended, or is unreachable. What is shown is from before"
+    what = f"{lost}, {fleet.lost_s:.0f} s ago."
+    return [Finding("fault", what, "connection", since_s=fleet.lost_s, lasting=f"{lost}.")]
+
+
+def check_awards(fleet: FleetSnapshot) -> list[Finding]:
+    """Check that somebody replies about the jobs while arms are present, and awards them: an auctioneer, or an arm
+    without one."""
+    last, age_s = fleet.last_reply
+    if age_s <= SILENT_S:
+        stopped = [each for each in fleet.auctioneers if each.trouble and (each.heard_age_s or 0.0) <= SILENT_S]
+        return [Finding("fault", each.trouble, "stopped", each.auctioneer) for each in stopped]
+    if not any(arm.present for arm in fleet.arms):
+        return []
+    silent = f"{last or 'Nobody'} has {'not ' if last else ''}replied about the jobs"
+    why = "its process hangs or has ended, and no job is awarded." if last else "no job is awarded."
+    return [Finding("fault", f"{silent} for {age_s:.0f} s: {why}", "silent", last, age_s, f"{silent}: {why}")]
 
 
 def check_jobs(fleet: FleetSnapshot) -> list[Finding]:
@@ -233,6 +258,8 @@ def check_space(fleet: FleetSnapshot) -> list[Finding]:
                 f"and is switched off: thermofleet arm clear {quote(arm)}",
                 "space",
                 arm,
+                lasting=f"The space of {arm} stays closed to other arms, as it is not present. Clear it once a person "
+                "has seen that it is at home or removed, and is switched off.",
             )
         )
     return findings
@@ -271,7 +298,8 @@ def check_arm(arm: ArmSnapshot, offset_s: float | None) -> list[Finding]:
         problem = "shows its token but publishes no state: its process may hang."
     elif age_s > FRESH_S:
         problem = f"is stale: its last state is {age_s:.1f} s old. Its process may hang."
-    findings = [Finding("fault", f"{arm.arm} {problem}", "absent", arm.arm)] if problem else []
+    absent = f"{arm.arm} is absent: it has left, or its process hangs or has ended."
+    findings = [Finding("fault", f"{arm.arm} {problem}", "absent", arm.arm, lasting=absent)] if problem else []
     if arm.mode == "faulted":
         hot = f"{arm.arm} is faulted: joint {arm.joint} is at {arm.hottest_c:.1f} °C."
         findings.append(Finding("warning", hot, "fault", arm.arm))

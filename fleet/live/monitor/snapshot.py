@@ -33,7 +33,7 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.keys import PUBLISHED
 from fleet.bus.protocol.messages import DifficultyScores, Info, State, encode
-from fleet.bus.protocol.operator import ALL_ARMS, Alarm, ControlRequest, Operation, Pause, Resume
+from fleet.bus.protocol.operator import ALL_ARMS, Alarm, ControlRequest, Operation, Pause, Resume, by_whom
 from fleet.errors import BusError
 from fleet.events import EVENT_KINDS
 from fleet.live.sensors import ArmSensors
@@ -51,6 +51,8 @@ COMPLETE_BYTES = 32_000
 
 STATUS_EVERY_S = 5.0
 """Real seconds between two requests of the clock and of all jobs, whose results may be older than the listener."""
+SILENT_S = 3 * STATUS_EVERY_S
+"""Real seconds without a reply about the jobs, after which nobody allocates them."""
 
 Role = Literal["arm", "auction"]
 Message = TypeVar("Message", bound=msgspec.Struct)
@@ -147,6 +149,8 @@ class AuctioneerSnapshot(msgspec.Struct, frozen=True):
     token: bool
     heard_age_s: float | None = None
     """Real seconds since its last message."""
+    trouble: str = ""
+    """Why it accepts and awards no jobs, from its last status reply; "" if it does."""
 
 
 class FleetSnapshot(msgspec.Struct, frozen=True):
@@ -169,6 +173,17 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
     """Number of changes of jobs by new state, since this listener began and of those that were still cached."""
     alarms: tuple[Alarm, ...] = ()
     """Those that last, and the last of the others; the most recently changed last."""
+    listened_s: float = 0.0
+    """Real seconds since this listener began."""
+    lost_s: float | None = None
+    """Real seconds since this listener lost its connection to the router; None if it has one."""
+
+    @property
+    def last_reply(self) -> tuple[str, float]:
+        """Who was the last to send a message about the jobs, "" for nobody, and how many real seconds ago."""
+        ages_s = [(each.heard_age_s, each.auctioneer) for each in self.auctioneers if each.heard_age_s is not None]
+        age_s, name = min(ages_s, default=(self.listened_s, ""))
+        return name, age_s
 
 
 @dataclass
@@ -207,6 +222,7 @@ class _Auctioneer:
     heard_s: float | None = None
     time_s: float = -math.inf
     """Fleet time of its last reply."""
+    trouble: str = ""
     counted: tuple[str, int] = "", -1
     """Epoch and number of its last result."""
 
@@ -234,6 +250,10 @@ class FleetView:
     fleet: str
     speed: float | None = None
     """Fleet seconds per real second; None while unknown."""
+    began_s: float | None = None
+    """Real second at which a listener began."""
+    lost_s: float | None = None
+    """Real second at which it lost its connection to the router; None if it has one."""
     _arms: "Recent[str, _Arm]" = field(default_factory=lambda: Recent(MAX_NAMES))
     _auctioneers: "Recent[str, _Auctioneer]" = field(default_factory=lambda: Recent(MAX_NAMES))
     _space: dict[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
@@ -282,7 +302,7 @@ class FleetView:
                 self._jobs.clear()
             for job in self._jobs.values():
                 job.number = 0
-        auctioneer.heard_s, auctioneer.time_s = now_s, reply.time_s
+        auctioneer.heard_s, auctioneer.time_s, auctioneer.trouble = now_s, reply.time_s, reply.trouble
         self._space, self._paused = dict(reply.space), dict(reply.paused)
         for status in reply.jobs:
             self._set_status(status, now_s)
@@ -305,12 +325,12 @@ class FleetView:
         ended = {status.job for status in statuses if status.state in ("finished", "unfinished")}
         waiting = {status.job: status.reason for status in statuses if status.state == "waiting"}
         arms = (_arm_snapshot(name, self._arms[name], now_s, self.speed, ended) for name in sorted(self._arms))
-        return FleetSnapshot(
+        now = FleetSnapshot(
             fleet=self.fleet,
-            arms=tuple(replace(arm, idle=why_idle(arm, waiting, self._paused)) for arm in arms),
+            arms=tuple(arms),
             auctioneers=tuple(
-                AuctioneerSnapshot(name, known.token, None if known.heard_s is None else now_s - known.heard_s)
-                for name, known in sorted(self._auctioneers.items())
+                AuctioneerSnapshot(name, each.token, _age_s(each.heard_s, now_s), each.trouble)
+                for name, each in sorted(self._auctioneers.items())
             ),
             counts=dict(Counter(status.state for status in statuses)),
             changes=dict(self._changes),
@@ -319,6 +339,12 @@ class FleetView:
             paused=dict(self._paused),
             speed=self.speed,
             alarms=tuple(self.alarms.values()),
+            listened_s=_age_s(self.began_s, now_s) or 0.0,
+            lost_s=_age_s(self.lost_s, now_s),
+        )
+        unserved = why_unserved(now)
+        return replace(
+            now, arms=tuple(replace(arm, idle=why_idle(arm, waiting, self._paused, unserved)) for arm in now.arms)
         )
 
     def _pause(self, request: ControlRequest) -> None:
@@ -371,7 +397,7 @@ class FleetListener:
         Args:
             on_message: Called after `view` was updated.
         """
-        self.view = FleetView(link.fleet)
+        self.view = FleetView(link.fleet, began_s=time.monotonic())
         self._link, self._on_message, self._on_presence = link, on_message, on_presence
         self._status_due_s = time.monotonic()
         for channel, message in PUBLISHED.items():
@@ -384,6 +410,10 @@ class FleetListener:
     def serve(self, until_s: float) -> None:
         """Handle messages until the real second `until_s`; request the fleet's clock and all jobs when that is due."""
         asked_s = time.monotonic()
+        if self._link.connected:
+            self.view.lost_s = None
+        elif self.view.lost_s is None:
+            self.view.lost_s = asked_s
         if asked_s >= self._status_due_s:
             self._status_due_s = asked_s + STATUS_EVERY_S
             fleet, done = self._link.fleet, partial(self._statuses, asked_s)
@@ -447,28 +477,43 @@ def describe_status(status: JobStatus) -> str:
     return f"{status.job}: {status.state}{arm}{end}{f': {status.reason}' if status.reason else ''}"
 
 
-def why_idle(arm: ArmSnapshot, waiting: Mapping[str, str], paused: Mapping[str, str]) -> str:
+def why_unserved(fleet: FleetSnapshot) -> str:
+    """Why no arm gets a job, as far as it is not for the arms or the jobs; "" for no such reason."""
+    last, age_s = fleet.last_reply
+    if age_s > SILENT_S:
+        return f"{last} has not replied for {age_s:.0f} s." if last else "Nobody has replied about the jobs."
+    return next((each.trouble for each in fleet.auctioneers if each.trouble and each.auctioneer == last), "")
+
+
+def why_idle(arm: ArmSnapshot, waiting: Mapping[str, str], paused: Mapping[str, str], unserved: str = "") -> str:
     """Why an arm has no job now; "" for one that has a job or is not present.
 
     Args:
         waiting: Reasons of the waiting jobs, by job.
         paused: As in a snapshot.
+        unserved: Why no arm gets a job.
     """
     if not arm.present or arm.job:
         return ""
     if (pause := next((name for name in (ALL_ARMS, arm.arm) if name in paused), None)) is not None:
-        return f"It is paused by '{paused[pause]}'."
+        return f"It is paused{by_whom(paused[pause])}."
     if arm.mode == "faulted":
         return "It is faulted."
     if arm.break_end_s is not None:
         return f"It is in a break until {timedelta(seconds=round(arm.break_end_s))} of fleet time."
     if arm.headroom_k is not None and arm.headroom_k <= 0.0:
         return "It is above its warning limit."
+    if unserved:
+        return unserved
     if not waiting:
         return "No job waits."
     named = next((f" {job}: {reason}" for job, reason in waiting.items() if arm.arm in reason), "")
     able = sum(job in waiting and score != JobScore() for job, score in arm.scores.items())
     return f"It has bids for {able} of {len(waiting)} waiting jobs.{named}"
+
+
+def _age_s(at_s: float | None, now_s: float) -> float | None:
+    return None if at_s is None else now_s - at_s
 
 
 def _complete(reply: Status) -> bool:

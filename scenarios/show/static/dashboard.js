@@ -102,6 +102,7 @@ function startPage() {
     switch (action) {
       case "pause": case "resume": return `asked to ${action} ${whom}`;
       case "settle": return `settled ${job} as ${outcome}`;
+      case "clear": return `freed the space of ${whom}`;
       case "change": return `changed ${job}:${due === undefined ? "" : due === null ? " no due date" : ` due at ${clock(due)}`}${value === undefined ? "" : ` value ${value}`}`;
       default: return `asked to ${action} ${job}`;
     }
@@ -136,8 +137,8 @@ function startPage() {
       setJob(result.status, result);
       if (what) note(`result/${name}/${result.number}/${result.time_s}`, result.time_s, what);
     },
-    operation(name, { time_s: timeS, request }) {
-      note(`operation/${request.request}`, timeS, `${request.by || "Nobody named"} ${describe(request.action)}`, "operation");
+    operation(name, { time_s: timeS, request, note: why }) {
+      note(`operation/${request.request}`, timeS, `${request.by || "Nobody named"} ${describe(request.action)}${why ? ` (${why})` : ""}`, "operation");
     },
     presence(_, { role, name, there }) {
       if (role === "arm") {

@@ -44,6 +44,7 @@ from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.rounds import Assignment
 from fleet.live.book import JobBook
+from fleet.live.epochs import kept_time_s
 from fleet.live.job_rules import status_reply
 from fleet.live.journal import EpochBegun, JobsAccepted, Journal
 from fleet.live.records import BookRecord
@@ -61,6 +62,7 @@ class Arm:
     def __init__(self, link, name):
         self.link, self.name = link, name
         self.done, self.awards, self.commits = [], [], True
+        self.kept_s, self.kept_epoch = 0.0, None
         self._numbers = count()
         self._current, self._answers, self._published_s, self._asked = None, {}, 0.0, False
         fleet = link.fleet
@@ -72,7 +74,9 @@ class Arm:
     def history(self, request):
         finished = tuple(award.job for award in self.awards if award.job.name in self.done)
         current = () if self._current is None or self._current.job.name in self.done else (self._current,)
-        return History(self.name, self.awards[-1].epoch if self.awards else "", finished, current)
+        epoch = self.awards[-1].epoch if self.awards else ""
+        epoch = epoch if self.kept_epoch is None else self.kept_epoch
+        return History(self.name, epoch, finished, current, time_s=self.kept_s)
 
     def quote(self, request):
         estimates = tuple(JobEstimate(job.name, (PlanQuote(finish_in_s=1.0),)) for job in request.jobs)
@@ -266,7 +270,7 @@ def test_a_journal_that_cannot_be_compacted_is_continued(bus, monkeypatch, caplo
     assert bus.states(again) == ["waiting"]
 
 
-def refuse(*_records):
+def refuse(*_records, **_options):
     raise JournalFull("no room")
 
 
@@ -477,12 +481,54 @@ def test_two_auctioneers_detect_each_other_and_neither_accept_nor_award_jobs(bus
         one.submit(Submission(bus.jobs("b")))
     status = bus.ask(keys.of_jobs("f", "status"), StatusRequest(), Status)
     assert {reply.auctioneer for reply in status.messages.values()} == {"one", other}
+    trouble = error.replace("accepted until", "accepted or awarded until")
+    assert {reply.trouble for reply in status.messages.values()} == {trouble}
+    assert {reply.jobs[0].reason for reply in status.messages.values()} == {trouble}
     bus.serve_for(0.5)
     assert bus.states(one) == bus.states(two) == ["waiting"]
     assert not arm.awards
     bus.kill(two)
     bus.until(lambda: bus.states(one) == ["finished"])
     assert arm.done == ["a"]
+
+
+def test_a_full_disk_is_told_as_the_trouble_and_as_the_reason_of_waiting_jobs(bus, monkeypatch):
+    monkeypatch.setattr(journal, "TICK_S", 0.01)
+    node = bus.auctioneer()
+    node.submit(Submission(bus.jobs("a")))
+
+    def status():
+        (reply,) = bus.ask(keys.of_jobs("f", "status"), StatusRequest(), Status).messages.values()
+        return reply.trouble, reply.jobs[0].reason
+
+    with monkeypatch.context() as full:
+        full.setattr(Journal, "_write", refuse)
+        bus.until(lambda: status()[0])
+        arm = bus.arm("arm_0")
+        bus.until(lambda: node.auctioneer.rounds.present)
+        assert status() == ("No jobs are accepted or awarded: no room",) * 2
+    bus.until(lambda: bus.states(node) == ["finished"])
+    assert (status()[0], arm.done) == ("", ["a"])
+
+
+def test_fleet_time_continues_as_the_arms_have_kept_it_while_there_was_no_auctioneer(bus):
+    """The median of the arms that know its epoch; others may keep another time."""
+    first = bus.auctioneer()
+    arms = [bus.arm(f"arm_{number}") for number in range(3)]
+    submit(bus, "a", "b", "c")
+    bus.until(lambda: bus.states(first) == ["finished"] * 3)
+    assert first.time_s < 100.0
+    bus.kill(first)
+    for arm, time_s in zip(arms, (1e9, 500.0, 480.0), strict=True):
+        arm.kept_s, arm.kept_epoch = time_s, first.epoch
+    again = served(bus, bus.auctioneer)
+    assert 500.0 <= again.time_s < 600.0
+    assert again.book.time_s >= 500.0
+    bus.kill(again)
+    for arm, epoch in zip(arms, ("other", "", "other"), strict=True):
+        arm.kept_s, arm.kept_epoch = 2000.0, epoch
+    assert kept_time_s([arm.history(None) for arm in arms], again.epoch) == 0.0
+    assert kept_time_s([], again.epoch) == 0.0
 
 
 def test_an_auctioneer_without_a_recent_check_for_others_awards_nothing(bus, monkeypatch):

@@ -7,6 +7,7 @@ import http.client
 import json
 import re
 from collections import Counter
+from contextlib import ExitStack
 from pathlib import Path
 
 import msgspec
@@ -16,6 +17,7 @@ from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobStatus
 from fleet.bus.protocol.operator import Alarm
+from fleet.bus.router import Router
 from fleet.errors import FleetError
 from fleet.live.auction.rounds import NOT_OFFERED
 from fleet.live.monitor import alarms
@@ -23,6 +25,8 @@ from fleet.live.monitor.snapshot import ArmSnapshot, AuctioneerSnapshot, FleetLi
 from scenarios.live import webhooks
 from scenarios.live.metrics import METRICS, exposition
 from scenarios.live.webhooks import MOST_WAITING, Webhook
+from tests.live.gateway.moving_fleet import MovingFleet
+from tests.live.gateway.served import Served
 from tests.waiting import PATIENCE_S, wait_until
 
 ODD = 'a"b\\c\nd'
@@ -114,15 +118,16 @@ def test_an_alarm_is_shown_acknowledged_and_published(gateway, arm, router):
     """The fault of an arm, from its event to the list of every listener on the bus."""
     with BusClient(router, "f") as link:
         listener = FleetListener(link)
-        arm.post(lambda: arm.set("lost job", state="given_up", reason="three faults"))
+        arm.post(lambda: arm.set("lost job", state="unfinished", reason="its arm is lost"))
 
         def alarm():
             found = [each for each in gateway.ask("GET", "/v4/alarms")[2] if each["subject"] == "lost job"]
             return found[0] if found else None
 
         seen = wait_until(alarm)
-        assert (seen["kind"], seen["by"], seen["ended_s"]) == ("given_up", "", None)
-        assert gateway.ask("POST", "/v4/alarms", {"alarm": seen["alarm"], "by": " "})[0] == 409
+        assert (seen["kind"], seen["by"], seen["ended_s"]) == ("unfinished", "", None)
+        for by, refused in (("", 422), (" ", 409)):
+            assert gateway.ask("POST", "/v4/alarms", {"alarm": seen["alarm"], "by": by})[0] == refused
         assert gateway.ask("POST", "/v4/alarms", {"alarm": "none", "by": "ann"})[0] == 409
         status, _, seen_by = gateway.ask("POST", "/v4/alarms", {"alarm": seen["alarm"], "by": "ann"})
         assert (status, seen_by["by"]) == (200, "ann")
@@ -141,7 +146,7 @@ def test_an_alarm_is_shown_acknowledged_and_published(gateway, arm, router):
     reply = line.getresponse()
     assert reply.headers["Content-Type"] == "text/plain; version=0.0.4; charset=utf-8"
     values, _ = parsed(reply.read().decode())
-    labels = (("acknowledged", "yes"), ("fleet", "f"), ("kind", "given_up"))
+    labels = (("acknowledged", "yes"), ("fleet", "f"), ("kind", "unfinished"))
     assert values["thermofleet_alarms", labels] == 1
     line.close()
 
@@ -162,6 +167,30 @@ def test_an_alarm_of_a_monitor_that_has_exited_ends(gateway, router, monkeypatch
         wait_until(lambda: {"of it", "silence"} <= lasting())
     wait_until(lambda: "of it" not in lasting())
     assert "silence" in lasting()
+
+
+def test_a_lost_connection_is_an_alarm_and_no_arm_is_called_absent(monkeypatch):
+    """The router ends and another one begins at its port."""
+    monkeypatch.setattr(alarms, "BEGIN_S", {"absent": 3.0})
+    monkeypatch.setattr(alarms, "HOLD_S", 0.0)
+    with ExitStack() as stack:
+        first = stack.enter_context(Router())
+        endpoint, port = first.endpoint, int(first.endpoint.rpartition(":")[2])
+        stack.enter_context(MovingFleet(endpoint, ("a",), fleet="f"))
+        gateway = stack.enter_context(Served(endpoint))
+
+        def listed():
+            return {(each["kind"], each["ended_s"] is None) for each in gateway.ask("GET", "/v4/alarms")[2]}
+
+        wait_until(lambda: gateway.ask("GET", "/v4/jobs")[0] == 200)
+        first.close()
+        wait_until(lambda: ("connection", True) in listed())
+        job = {"name": "x", "kind": "hold", "places": ["rack"]}
+        status, _, problem = gateway.ask("POST", "/v4/ask", {"jobs": [job]})
+        assert (status, problem["detail"][:37]) == (503, "The connection to the router is lost:")
+        stack.enter_context(Router(port))
+        wait_until(lambda: ("connection", False) in listed())
+        assert listed() == {("connection", False)}
 
 
 async def receiver(replies, requests):

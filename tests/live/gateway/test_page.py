@@ -233,7 +233,26 @@ def test_jobs_are_submitted_and_quoted(gateway, arm):
         ("DELETE", "/v4/jobs", None, {}, 405, "Not Allowed"),
         ("GET", "/v4/fleet", None, {"Host": "evil.example"}, 421, "evil.example"),
         ("GET", "/page/cell.js", None, {"Host": "evil.example:80"}, 421, "evil.example"),
-        ("POST", "/v4/control", {"request": "1", "action": {"action": "fly"}}, {}, 422, "Not a"),
+        (
+            "POST",
+            "/v4/control",
+            {"request": "1", "action": {"action": "fly"}},
+            {},
+            422,
+            "`. Allowed: cancel, change, clear, pause, resume, settle",
+        ),
+        (
+            "POST",
+            "/v4/control",
+            {"request": "1", "action": {"action": "settle", "job": "a", "outcome": "so"}},
+            {},
+            422,
+            "`. Allowed: done, redo",
+        ),
+        ("POST", "/v4/jobs", {"jobs": [{**CRATE_JSON, "kind": "fly"}]}, {}, 422, "`. Allowed: hold, pick_place"),
+        ("GET", "/v4/fleet?jobs=all", None, {}, 422, "?jobs=N is the number of jobs to list, 0..4096 (got 'all')."),
+        ("GET", "/v4/jobs?name=a", None, {}, 422, "There is no parameter 'name' of this request. Parameters: job."),
+        ("POST", "/v4/reset?arm=a", {"arm": "a"}, {}, 422, "There is no parameter 'arm' of this request. It has none."),
     ],
 )
 def test_an_error_is_a_problem_document(gateway, method, path, body, headers, status, says):
@@ -241,6 +260,16 @@ def test_an_error_is_a_problem_document(gateway, method, path, body, headers, st
     assert (got, kind) == (status, "application/problem+json")
     assert told["status"] == status
     assert says in told["detail"]
+
+
+def test_a_path_names_all_its_methods(gateway):
+    line = http.client.HTTPConnection("127.0.0.1", gateway.port, timeout=PATIENCE_S)
+    for method, path in (("PUT", "/v4/jobs"), ("DELETE", "/v4/alarms")):
+        line.request(method, path)
+        reply = line.getresponse()
+        assert (reply.status, {*reply.headers["Allow"].split(", ")}) == (405, {"GET", "HEAD", "POST"})
+        reply.read()
+    line.close()
 
 
 def test_a_table_is_submitted_in_messages_or_all_its_faults_are_told(gateway, arm):

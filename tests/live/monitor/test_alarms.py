@@ -12,7 +12,7 @@ from fleet.bus.protocol.auction import JobStatus, Status
 from fleet.bus.protocol.operator import Alarm
 from fleet.errors import Refused
 from fleet.live.monitor.alarms import HOLD_S, AlarmList
-from fleet.live.monitor.health import Finding, check_jobs, check_replies
+from fleet.live.monitor.health import Finding, check_awards, check_connection, check_jobs
 from fleet.live.monitor.snapshot import MAX_ALARMS, FleetSnapshot, FleetView
 from scenarios.live.recorder import Recorder
 from scenarios.live.recording import alarms_of
@@ -209,17 +209,52 @@ def test_the_alarm_of_a_silence_begins_with_the_last_reply():
     view.set_token("auction", "au", True)
     view.update_jobs(Status("au", 800.0, ()), 0.0)
     view.update("a", state(time_s=2000.0), 20.0)
-    findings = check_replies(view.snapshot(20.0))
+    findings = check_awards(view.snapshot(20.0))
     alarms = AlarmList("m", {})
     assert alarms.update(findings, 2000.0, 20.0, speed=60.0) == []  # after an outage of the router it is asked anew
     view.update("a", state(time_s=2360.0), 26.0)
-    findings = check_replies(view.snapshot(26.0))
+    findings = check_awards(view.snapshot(26.0))
     (alarm,) = alarms.update(findings, 2360.0, 26.0, speed=60.0)
     assert (alarm.kind, alarm.subject, alarm.time_s, alarm.began_s) == ("silent", "au", 2360.0, 800.0)
 
 
+def test_a_job_that_is_given_up_raises_one_alarm_which_ends_when_somebody_has_seen_it():
+    lost = Finding("warning", "'a' is abandoned: three faults", "given_up", "a")
+    alarms = AlarmList("m", {})
+    (begun,) = alarms.update([lost], 5.0, 5.0)
+    assert alarms.update([lost], 60.0, 60.0) == []
+    seen = alarms.acknowledge(begun.alarm, "ann", 70.0, NOON)
+    assert (seen.by, seen.ended_s) == ("ann", 70.0)
+    assert alarms.update([lost], 80.0, 80.0) == alarms.update([lost], 90.0, 90.0) == []
+    again = AlarmList("m", {}, [seen])
+    assert again.update([lost], 100.0, 1.0) == []
+
+
+def test_a_listener_says_who_does_not_reply_and_why_nobody_awards_jobs():
+    """Also if nobody has ever replied; without a connection nothing is known."""
+    view = FleetView("f", began_s=0.0)
+    view.set_token("arm", "a", True)
+    view.update("a", state(), 15.0)
+    assert check_awards(view.snapshot(15.0)) == []
+    view.update("a", state(), 16.0)
+    (silent,) = check_awards(view.snapshot(16.0))
+    assert (silent.kind, silent.subject, silent.since_s) == ("silent", "", 16.0)
+    assert silent.what == "Nobody has replied about the jobs for 16 s: no job is awarded."
+    assert view.snapshot(16.0).arms[0].idle == "Nobody has replied about the jobs."
+    view.update_jobs(Status("au", 1.0, (), trouble="The disk is full."), 17.0)
+    (stopped,) = check_awards(view.snapshot(17.0))
+    assert (stopped.level, stopped.kind, stopped.subject) == ("fault", "stopped", "au")
+    assert stopped.what == view.snapshot(17.0).arms[0].idle == "The disk is full."
+    view.update_jobs(Status("au", 2.0, ()), 18.0)
+    assert check_awards(view.snapshot(18.0)) == check_connection(view.snapshot(18.0)) == []
+    view.lost_s = 18.0
+    (lost,) = check_connection(view.snapshot(20.0))
+    assert (lost.kind, lost.since_s) == ("connection", 2.0)
+    assert lost.what.endswith("What is shown is from before, 2 s ago.")
+
+
 def test_an_absence_raises_an_alarm_once_it_lasts_and_the_end_of_the_shift_raises_none():
-    lasting = Finding("fault", "arm_1 publishes its state but shows no token", "absent", "arm_1")
+    lasting = Finding("fault", "arm_1 is stale: 9 s", "absent", "arm_1", lasting="arm_1 is absent.")
     closed = Finding("fault", "The space of arm_1 stays closed; 5 job(s) wait for it", "space", "arm_1")
     alarms = AlarmList("m", {})
     for real_s in (0.0, 1.0, 2.5):  # as while a router restarts
@@ -232,8 +267,7 @@ def test_an_absence_raises_an_alarm_once_it_lasts_and_the_end_of_the_shift_raise
     assert alarms.update([waiting, lasting, closed], 1320.0, 17.0, speed=60.0) == []
     assert [each.began_s for each in alarms.update([waiting, lasting, closed], 1380.0, 18.0, speed=60.0)] == [780.0]
     assert (begun.began_s, space.began_s) == (600.0, 600.0)
-    assert begun.what == "arm_1 is absent: it has left, or its process hangs or has ended."
-    assert space.what.startswith("The space of arm_1 stays closed to other arms, as it is not present. Clear it once")
+    assert (begun.what, space.what) == ("arm_1 is absent.", closed.what)
     jobs = (JobStatus("a", "unfinished", shift_ended=True), JobStatus("b", "unfinished", reason="An arm stopped."))
     fleet = FleetSnapshot("f", (), (), {}, jobs)
     assert [finding.subject for finding in check_jobs(fleet)] == ["b"]
