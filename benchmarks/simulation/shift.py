@@ -6,7 +6,7 @@ arms that are idle at home take no space; requests of people have their effect (
 result once (`recording`).
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from benchmarks.simulation.participants import AUCTIONEER, CLIENT, Watch, simulated_system
@@ -66,6 +66,8 @@ class Shift(Fleet):
         self.faults: dict[str, list[str]] = {}
         self.cancelled: set[str] = set()
         """Jobs that a person has asked to cancel."""
+        self.redone: set[str] = set()
+        """Jobs that a person has asked to redo before their last cycle was begun."""
         self.work_s = 0.0
         self.healed = False
         self.jobs: list[JobSpec] = []
@@ -98,6 +100,13 @@ class Shift(Fleet):
             self._settle()
             self._check_space()
             self._end_recording()
+
+    def begins_last_cycle(self, arm: str, job: str) -> None:
+        """Check as a fleet does. The arm breaks down if a person has asked to redo the job."""
+        super().begins_last_cycle(arm, job)
+        if job in self.redone and not self.healed:
+            self.redone.discard(job)
+            self.world.after(0.0, _break_down, self, self.world.processes[arm])
 
     def _submit(self) -> None:
         rng, names = self.rng, [job.name for job in self.jobs]
@@ -404,7 +413,10 @@ def overheat(shift: Shift) -> None:
 
 def break_machine(shift: Shift) -> None:
     """Kill an arm that does not start again for some time; a person moves it home and frees its space."""
-    process = _arm(shift, busy=True)
+    _break_down(shift, _arm(shift, busy=True))
+
+
+def _break_down(shift: Shift, process: Process) -> None:
     process.broken = True
     process.kill("breaks down")
     shift.world.after(shift.rng.uniform(3.0, 15.0), clear, shift, process.name)
@@ -442,10 +454,30 @@ def steer(shift: Shift) -> None:
     request(shift, shift.rng.choice(actions))
 
 
-def request(shift: Shift, action: Action) -> None:
-    """Send a request of a person, again until there is a reply or the fleet is healed; and sometimes once more."""
+def redo_early(shift: Shift, tries: int = 100) -> None:
+    """Cut off an arm that may begin the last cycle of a job, and has not; a person asks to redo the job meanwhile."""
+    nodes = [(name, node) for name in shift.arms if (node := shift.node(name)) is not None]
+    ready = [(name, each.job) for name, node in nodes for each in node.executor.active if each.may_commit]
+    if early := [(name, job) for name, job in ready if not shift.begun.get(job)]:
+        name, job = early[0]
+        _cut(shift, {name: 1}, 14.0)
+        shift.world.after(9.0, request, shift, Settle(job, "redo"), lambda: not shift.begun.get(job))
+    elif tries:
+        shift.world.after(0.2, redo_early, shift, tries - 1)
+
+
+def request(shift: Shift, action: Action, wanted: Callable[[], object] = lambda: True) -> None:
+    """Send a request of a person, again until there is a reply or the fleet is healed; and sometimes once more.
+
+    Args:
+        wanted: Whether the person still has a reason for it.
+    """
+    if not wanted():
+        return
     if isinstance(action, Cancel):
         shift.cancelled.add(action.job)
+    elif isinstance(action, Settle) and action.outcome == "redo":
+        shift.redone.add(action.job)
     message = ControlRequest(str(shift.world.now_s), action, "a person")
     shift.world.log("person", f"requests {action}")
     link: Any = shift.world.processes[CLIENT].client
@@ -471,7 +503,7 @@ def kill_supervisor(shift: Shift) -> None:
 FAULTS = (
     *(kill, kill_at_work, lose_power, crash_at_write, crash_at_write, fill_disk, break_disk, stop, stop_at_work, cut),
     *(cut_off_at_work, cut_off_at_work, lose_router, lose_messages, lose_messages, overheat, break_machine, move_home),
-    *(kill_supervisor, fill_log_disk, lose_rack, swizzle, steer, steer),
+    *(kill_supervisor, fill_log_disk, lose_rack, swizzle, steer, steer, redo_early),
 )
 
 

@@ -24,6 +24,7 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.operator import ALL_ARMS, Clear, Operation, Pause, Resume, Settle
 from fleet.job import reason_to_give_up
+from fleet.live import book as book_module
 from fleet.live.auction.rounds import Assignment
 from fleet.live.leases import Timing
 from fleet.live.space import ANYWHERE
@@ -274,6 +275,19 @@ def test_an_arm_that_is_online_again_after_it_was_cleared_takes_its_space_until_
         fleet.cut()
     fleet.until(lambda: fleet.finished == {"a": 1, "b": 1})
     fleet.until(lambda: fleet.is_everywhere("a", "finished") and fleet.is_everywhere("b", "finished"))
+
+
+def test_an_arm_learns_the_end_of_a_job_that_its_peers_have_forgotten(fleet_of):
+    """Otherwise it would never begin a job that waits for it, which its peers may not be able to do."""
+    fleet = fleet_of(True)
+    fleet.cut(fleet.arms[-1])
+    fleet.submit(job("a", 1), *(job(f"job {number}", 1) for number in range(book_module.MAX_SETTLED)))
+    books = [fleet.node(arm).work_source.book for arm in fleet.arms]
+    fleet.until(lambda: all("a" in book.past for book in books[:-1]))
+    fleet.submit(job("d", after=("a",), release_s=1e6))
+    assert not books[-1].is_known("a")
+    fleet.cut()
+    fleet.until(lambda: books[-1].is_known("d") and books[-1].is_finished("a"))
 
 
 def test_the_space_of_an_arm_that_is_not_known_cannot_be_cleared(fleet_of, alone):

@@ -242,6 +242,12 @@ class Participant:
             return grant.record.arm in self._present
         return entry.state not in SETTLED and self.book.operations.cancelled(entry.name) is None
 
+    def _missed(self) -> list[str]:
+        """Return the jobs that others wait for and of which this arm knows nothing: a peer may know their outcomes."""
+        book = self.book
+        awaited = dict.fromkeys(name for entry in book.waiting.values() if entry.spec for name in entry.spec.after)
+        return [name for name in awaited if not (book.is_known(name) or book.is_settled(name))]
+
     def status(self, later: Iterable[JobSpec], real_s: float) -> list[JobStatus]:
         """Return the status of all known jobs, and of `later` ones that are not offered yet."""
         bids = self._fresh_bids(real_s)
@@ -321,7 +327,7 @@ class Participant:
             capacity=capacity,
             estimates=self._arm.estimate(tuple(ready), cycles) if ready else (),
             open_count=len(open_jobs),
-            open_jobs=tuple(open_jobs[:MAX_OPEN_JOBS]),
+            open_jobs=(*self._missed(), *open_jobs)[:MAX_OPEN_JOBS],
             choice=self._choice.job,
             choice_plan=self._choice.plan,
             epoch=book.epoch,
