@@ -241,7 +241,7 @@ class Auctioneer:
         waits = status.state == "waiting"
         spec = self.book.jobs[status.job].spec if waits else None
         note = "" if spec is None else self.rounds.reason_to_wait(spec, busy)
-        planned = not waits or self.rounds.is_planned(status.job)
+        planned = not waits or bool(status.arm) or self.rounds.is_planned(status.job)  # an arm had it before
         expected_s, reason = finish_s(status, self.rounds.states.get(status.arm)), joined_reasons(status.reason, note)
         return replace(status, cycles=cycles, reason=reason, finish_s=expected_s, not_planned=not planned)
 
