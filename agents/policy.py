@@ -17,6 +17,9 @@ from fleet.observation import FIELDS, LazyObservation, Observation
 
 Array = np.ndarray
 
+SHARED = frozenset(field.name for field in FIELDS if field.part == "fleet")
+"""Fields of an observation that come by messages of peers."""
+
 SCOPES = ("central", "arm")
 
 WAIT = 0
@@ -262,7 +265,10 @@ class EveryArm:
         if together:
             actions = together(np.zeros(1, dtype=int), one_fleet(tuple(observations.values())))
             return dict(zip(observations, actions[0].tolist(), strict=True))
-        return {arm: self.of(arm).choose(seen, i) for i, (arm, seen) in enumerate(observations.items())}
+        known = observations.values() if reads_messages(self) else map(own_only, observations.values())
+        return {
+            arm: self.of(arm).choose(seen, i) for i, (arm, seen) in enumerate(zip(observations, known, strict=True))
+        }
 
     def of(self, arm: str) -> ArmPolicy:
         """The instance of an arm."""
@@ -294,7 +300,8 @@ def on_arrays(policies: Mapping[int, Policy], arms: Sequence[str]) -> Callable[[
     if not _decides(kind):
         return None
     each = {e: policy.of(arms[0]) if isinstance(policy, EveryArm) else policy for e, policy in policies.items()}
-    return lambda envs, seen: kind.decide([each[e] for e in envs.tolist()], seen, arms)
+    given = own_only if isinstance(first, EveryArm) and not reads_messages(first) else lambda seen: seen
+    return lambda envs, seen: kind.decide([each[e] for e in envs.tolist()], given(seen), arms)
 
 
 def _decides(kind: type) -> bool:
@@ -326,9 +333,20 @@ def reads_messages(policy: Policy) -> bool:
     """Whether the decisions of a policy depend on messages between arms: the bus affects no other.
 
     A central policy sees the observations of all arms. A class of scope `arm` declares `reads_messages = False` if it
-    reads no field of the fleet.
+    reads no field of the fleet; `EveryArm` then refuses these fields.
     """
     return getattr(policy, "scope", "central") == "arm" and getattr(_kind_of(policy), "reads_messages", True)
+
+
+def own_only(seen: Observation) -> Observation:
+    """The observation without what arms share: a policy that declares `reads_messages = False` and reads it fails."""
+
+    def read(name: str) -> Array:
+        if name in SHARED:
+            raise ValueError(f"The policy declares reads_messages = False, but reads {name}, which its peers send.")
+        return getattr(seen, name)
+
+    return LazyObservation(read)
 
 
 def _kind_of(policy: Policy | None) -> Any:

@@ -60,6 +60,17 @@ def switch(name: str, value: object) -> bool:
     return bool(value)
 
 
+def time_from_zero(name: str, value: object) -> float:
+    """A time >= 0, or infinity.
+
+    Raises:
+        ValueError: no such number.
+    """
+    if isinstance(value, bool) or not isinstance(value, float | int | np.floating | np.integer) or not value >= 0:
+        raise ValueError(f"{name} must be a number of seconds >= 0, or inf (got {value!r}).")
+    return float(value)
+
+
 def check_choice(name: str, value: object, allowed: Iterable[object]) -> None:
     """Raise a ValueError unless the value is one of the allowed ones."""
     if value not in (allowed := tuple(allowed)):

@@ -22,7 +22,7 @@ from fleet.engine.state import State
 from fleet.engine.step import FINISHED, JOBS_DONE, OUTCOME, TICK, TOTAL
 from fleet.engine.tables import INFO, Tables
 from fleet.env.lookahead import CellSimulator, Lookahead
-from fleet.env.validation import Decisions, at_least_one, check_choice, seeds_of, switch
+from fleet.env.validation import Decisions, at_least_one, check_choice, seeds_of, switch, time_from_zero
 from fleet.observation import Layout, Observation
 from fleet.seeding import exchange_seed, shift_seeds
 
@@ -182,9 +182,9 @@ class BatchEnv:
             library.slots,
             library.near,
             library.tables.work.shape[3],
-            scaled=scaled,
+            scaled=switch("scaled", scaled),
             delivered=exchanges is not None,
-            ahead_s=ahead_s,
+            ahead_s=time_from_zero("ahead_s", ahead_s),
             bids=switch("bids", bids),
         )
         _check_memory(num_envs, self.layout)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 Algorithm = Literal["mappo", "ippo"]
 TrainingSplit = Literal["train"]
 """The other splits are for validation and for results."""
+BoardSplit = Literal["test", "validation"]
 PAGE = "index.html"
 _SUBMIT = "Check a result and write the file to send"
 FOLDER = Path("docs/results/leaderboard")
@@ -190,8 +191,8 @@ def compare_command(
     ),
     difficulty: str = option(
         "Sources of predictions, separated by commas: twin, oracle (simulator), blind (none), or models to "
-        "compare: trained, untrained, unweighted, torque, rc-nominal, rc, random. With several, POLICY@SOURCE "
-        "names a policy.",
+        "compare: trained, untrained, unweighted, torque, rc-nominal, rc, random; trained-alone, untrained-alone "
+        "and torque-alone without thermometers. With several, POLICY@SOURCE names a policy.",
         "twin",
     ),
     randomise: list[str] | None = options.RANDOMISE,
@@ -249,7 +250,7 @@ def compare_command(
     names = study.competitors
     base = baseline or names.get(("round_robin", study.sources[0]), next(iter(names.values())))
     check_baseline(study, base)
-    known = references_of(cases, references)
+    known = references_of(cases, references, study.sources)
     with progress_bar(kept="Finished shifts are" if out else KEPT, file=out) as progress:
         rows = run_study(study, out=out, workers=workers or -1, ray=ray, progress=progress, tell=say)
     results = comparisons(study, rows, base, suite, known)
@@ -309,6 +310,8 @@ def bounds_command(
     from scenarios.policy_loader import scope_of
 
     if show_only:
+        if scenarios or suite:
+            raise FleetError("--show prints all rows of the file: leave the scenarios and --suite out.")
         if not out.is_file():
             raise FleetError(f"There is no file '{out}' to --show. Compute it first, or give another --out.")
         found = bounds.load_references(out)
@@ -361,9 +364,8 @@ def leaderboard_command(
     from scenarios.evaluate.statistics import LEGEND
     from scenarios.show.comparison_page import narrow_score_tables
     from scenarios.spec.parse import choose
-    from scenarios.spec.schema import SplitName
 
-    split = choose("split", split, SplitName)
+    split = choose("split", split, BoardSplit)
     if not folder.is_dir():
         raise FleetError(f"'{folder}' is no folder. Give the folder of the results.")
     board = board_of(split, read_all(folder, split))

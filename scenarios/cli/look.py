@@ -372,8 +372,9 @@ def report_command(
     as_json: bool = option("--trace: print JSON.", False, flag="--json"),
 ) -> None:
     """Write the page of a run or recording, finished or not, or of several runs; with --trace, explain an event."""
+    from scenarios.evaluate.study import CARD
     from scenarios.live.recording_report import open_recording
-    from scenarios.result_folder import new_file
+    from scenarios.result_folder import check_file, new_file
     from scenarios.run.log import open_run
     from scenarios.spec.load import load
 
@@ -385,6 +386,10 @@ def report_command(
         _compare_runs(folders, out)
         return
     folder = folders[0] if folders else last_folder(Path("runs"))
+    if out is not None:
+        check_file(out, (".html",), overwrite=True)
+    if (folder / CARD).exists():
+        raise FleetError(f"'{folder}' is of `thermofleet compare`: open its index.html in a browser.")
     if trace is not None:
         from scenarios.live.trace import thread_of, thread_table
 
@@ -423,7 +428,7 @@ def _compare_runs(folders: Sequence[Path], out: Path | None) -> None:
         if path.suffix.lower() == ".html":
             draft.write_text(runs_page(logs), encoding="utf-8")
         else:
-            draft.write_bytes(runs_table(logs).content(path.suffix.lower()))
+            draft.write_bytes(runs_table(logs, in_file=True).content(path.suffix.lower()))
     say(f"Written to {path}.", out_console)
 
 

@@ -93,6 +93,8 @@ class Comparison:
     """Of every shift, the same for every policy."""
     sources: tuple[str, ...] = ()
     """Of the predictions."""
+    referenced: int = 0
+    """Shifts with a reference."""
     failed_baseline: str = ""
     """The baseline that was asked for, if it failed: another one takes its place."""
 
@@ -330,11 +332,12 @@ def comparison_of(
         scores = scores_of(values, baseline) if values else None
     fleets, trainings, per_fleet = study.shape
     sampled = count if groups is None else len(set(cells))
+    each_seeds = f", {per_fleet} seeds each" if per_fleet > 1 else ""
     several = (sampled, study.most_trainings) if count > 1 else (fleets if fleets > 1 else trainings, per_fleet)
     return Comparison(
         scenario=name or rows[0].key.instance,
         seeds=tuple(dict.fromkeys(row.key.seed for row in rows)),
-        unit=unit(study.shape) if count == 1 else unit_of(cells) + and_trainings(study.most_trainings),
+        unit=unit(study.shape) if count == 1 else unit_of(cells) + and_trainings(study.most_trainings) + each_seeds,
         draws=fewest(several),
         baseline=baseline,
         figures=figures,
@@ -347,6 +350,7 @@ def comparison_of(
         scores=scores,
         randomise=study.randomise or Randomisation(),
         sources=study.sources,
+        referenced=len({(row.key.instance, row.key.seed) for row in rows} & (references or {}).keys()),
     )
 
 

@@ -148,7 +148,8 @@ class ShiftSimulator:
 
 
 def without_scores(world: World) -> World:
-    """Remove the predictions from a world, which only policies read; awards do not change."""
+    """Remove the predicted peaks and probabilities from a world, which only policies read; the difficulties stay, by
+    which conflicting claims are resolved."""
     tables = world.tables
     work, curve = tables.work.copy(), tables.forecast_curve[:0]
     work["risk"] = work["peak"] = -1

@@ -308,11 +308,16 @@ HEADS = ("instance", "random", "best start", "reward", "hindsight", "upper bound
 def reference_table(references: Sequence[ShiftReference]) -> Table:
     """Every instance, and the mean of each scenario with several; times only if they are known."""
     rows: list[tuple[str, ...]] = []
-    for scenario in dict.fromkeys(each.instance.rpartition("/")[0] for each in references):
-        own = [each for each in references if each.instance.rpartition("/")[0] == scenario]
-        rows += [_cells(each.instance, each.rule, [each]) for each in own]
+    several = len({each.difficulty for each in references}) > 1
+
+    def group_of(each: ShiftReference) -> tuple[str, str]:
+        return each.instance.rpartition("/")[0], f"@{each.difficulty}" if several else ""
+
+    for scenario, source in dict.fromkeys(map(group_of, references)):
+        own = [each for each in references if group_of(each) == (scenario, source)]
+        rows += [_cells(f"{each.instance}{source}", each.rule, [each]) for each in own]
         if len(own) > 1:
-            rows.append(_cells(f"{scenario}, mean", "", own))
+            rows.append(_cells(f"{scenario}{source}, mean", "", own))
     heads = HEADS if any(each.seconds is not None for each in references) else HEADS[:-1]
     return Table(head=heads, rows=tuple(row[: len(heads)] for row in rows))
 

@@ -181,11 +181,11 @@ def run_study(
     """The rows of a study, in the order of its keys.
 
     Args:
-        out: Folder of the rows; those that are in it are not run again.
+        out: Folder of the rows; those that are in it are not run again, unless they failed.
         workers: Processes, if there is work for more than some seconds; -1 for one per core. The rows do not depend
             on it.
         ray: Address of a Ray cluster to run on instead.
-        tell: Called with a sentence about each process that dies.
+        tell: Called with a sentence about what is run again, and about each process that dies.
 
     Raises:
         FleetError: a fleet cannot be prepared, the folder holds something else, or the cluster cannot be reached.
@@ -196,16 +196,19 @@ def run_study(
         require_extra("report")
     with nullcontext(Store()) if out is None else opened(out, study.card) as store:
         # The largest first, so that processes end together; what shares plans follows.
-        units = sorted(study.units(store.rows), key=lambda unit: (-unit.size, unit.cell))
+        done = [key for key, row in store.rows.items() if row.error is None]
+        if failed := sum(key in store.rows and store.rows[key].error is not None for key in wanted):
+            tell(f"Running again what failed before: {failed} shift{'s' * (failed > 1)}.")
+        units = sorted(study.units(done), key=lambda unit: (-unit.size, unit.cell))
         # The folder is stated here, because a worker may have started with another one; other machines have their own.
         settings = Settings.of(study, cache_dir if ray else cache_dir or cache_folder())
         if ray is None or any(map(is_trained, study.sources)):
             _prepare_once(units, settings, progress)
-        done = len(wanted) - sum(len(unit.case.seeds) for unit in units)
+        count = len(wanted) - sum(len(unit.case.seeds) for unit in units)
         for rows in _run(units, settings, workers, ray, tell):
             store.add(rows)
-            done += len(rows)
-            progress("comparing", Count(done, len(wanted)))
+            count += len(rows)
+            progress("comparing", Count(count, len(wanted)))
         return [store.rows[key] for key in wanted]
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fleet.errors import FleetError
 from scenarios.evaluate.statistics import Interval, aggregates, by_group, holm, improvement, interval, paired
 from scenarios.evaluate.study import Case, Row
 from scenarios.policy_loader import has_trainings
@@ -230,27 +231,39 @@ def split_file(split: str) -> Path:
     return Path(str(resources.files("scenarios").joinpath("suite/references", f"{split}.jsonl")))
 
 
-def references_of(cases: Sequence[Case], file: Path | None = None) -> "dict[Shift, ShiftReference]":
+def references_of(
+    cases: Sequence[Case], file: Path | None = None, sources: Sequence[str] = ()
+) -> "dict[Shift, ShiftReference]":
     """The references of those shifts that have one.
 
     Args:
         file: Rows of `thermofleet bounds`; without it those of the splits that come with the package.
+        sources: Of the predictions: of several references of a shift that with one of these counts.
 
     Raises:
-        FleetError: the file is no such file.
+        FleetError: the file is no such file, or has several references of a shift, of which none or several count.
     """
     from scenarios.evaluate.references import load_references
 
     splits = dict.fromkeys(case.name.partition("/")[0] for case in cases if "/" in case.name)
     files = [file] if file else [path for path in map(split_file, splits) if path.is_file()]
-    rows = {(each.instance, each.seed): each for path in files for each in load_references(path)}
+    rows: dict[tuple[str, int, str], dict[str, ShiftReference]] = {}
+    for each in (each for path in files for each in load_references(path)):
+        rows.setdefault((each.instance, each.seed, each.scenario_hash), {})[each.difficulty] = each
     found: dict[Shift, ShiftReference] = {}
     for case in cases:
         content = scenario_hash(case.scenario)
         for seed in case.seeds:
-            own = rows.get((case.name if "/" in case.name else f"{case.name}/{seed}", seed))
-            if own and own.scenario_hash == content:
-                found[case.name, seed] = own
+            name = case.name if "/" in case.name else f"{case.name}/{seed}"
+            of_source = rows.get((name, seed, content), {})
+            known = {source: each for source, each in of_source.items() if len(of_source) == 1 or source in sources}
+            if len(known) == 1:
+                found[case.name, seed] = next(iter(known.values()))
+            elif of_source:
+                raise FleetError(
+                    f"'{file}' has references of {name} with several --difficulty ({', '.join(of_source)}), whose zero "
+                    "differs. Compare with one of these, or give a file with one: thermofleet bounds --out FILE."
+                )
     return found
 
 

@@ -103,7 +103,7 @@ def interval(values: ArrayLike, *, least: float = -np.inf, most: float = np.inf,
     if not np.isnan(low):
         return Interval(mean, max(low, least), min(high, most), p)
     if x.size == 1:
-        return Interval(mean, note="one value")
+        return Interval(mean, note=ONE)
     note = f"no variation in {draws(x)}"
     if not np.isfinite(most - least) or mean not in (least, most):
         return Interval(mean, note=note)
@@ -294,6 +294,7 @@ def holm(p: ArrayLike) -> Array:
 DRAWS = 4000
 FEWEST_RESAMPLED = 5
 """Of fewer independent scores, percentiles of resamples cover the true value too seldom: of four in 87 %."""
+FEW = f"fewer than {FEWEST_RESAMPLED} instances or cells, whose range no resample leaves"
 TRIM = 0.25
 """Share of the scores that the interquartile mean leaves out at each end."""
 
@@ -348,7 +349,8 @@ def improvement(scores: ArrayLike, base: ArrayLike, *, groups: ArrayLike | None 
         groups: As of `aggregates`.
 
     Returns:
-        The interval; 0.5 is no difference, and `p` is not given.
+        The interval; 0.5 is no difference, and `p` is not given. No bounds with less than `FEWEST_RESAMPLED` instances
+        or groups, unless all are better or none is.
 
     Raises:
         ValueError: as `aggregates`, or different numbers of instances.
@@ -363,6 +365,8 @@ def improvement(scores: ArrayLike, base: ArrayLike, *, groups: ArrayLike | None 
     share, (most, least) = float(better.mean()), _beyond(x.shape, groups)
     if share in (0, 1):
         return Interval(share, share and least, share or most, note="the same everywhere, Clopper–Pearson")
+    if _few(x, groups):
+        return Interval(share, note=FEW)
     return percentile_interval(share, drawn / better.size, clusters=_clusters(x.shape, groups))
 
 
@@ -392,12 +396,15 @@ def _beyond(shape: tuple[int, ...], groups: ArrayLike | None) -> tuple[float, fl
     return most, 1 - most
 
 
+def _few(x: Array, groups: ArrayLike | None) -> bool:
+    return (x.shape[1] if groups is None else int(np.max(groups)) + 1) < FEWEST_RESAMPLED
+
+
 def _aggregate(x: Array, groups: ArrayLike | None) -> Aggregate:
     weights, lack = _weights(x.shape, groups), 1 - np.minimum(x, 1)
     whole = _trimmed(x, np.ones((1, *x.shape)))
-    if (x.shape[1] if groups is None else int(np.max(groups)) + 1) < FEWEST_RESAMPLED:
-        note = f"fewer than {FEWEST_RESAMPLED} instances or cells, whose range no resample leaves"
-        return Aggregate(*(Interval(float(each), note=note) for each in (whole[0], lack.mean())))
+    if _few(x, groups):
+        return Aggregate(*(Interval(float(each), note=FEW) for each in (whole[0], lack.mean())))
     iqm = _trimmed(x, weights)
     gap = weights.reshape(DRAWS, -1) @ lack.ravel() / x.size
     clusters = _clusters(x.shape, groups)
@@ -483,7 +490,8 @@ def _checked_scores(scores: ArrayLike) -> Array:
 
 
 LEGEND = "95 % intervals; * excludes 0, ** also after Holm's correction over the table"
-EQUAL = "all equal"
+EQUAL, ONE = "all equal", "one value"
+"""In place of an interval."""
 HEAD = ("", "mean", "interval", "difference", "interval", "")
 MORE_DIGITS = 3
 """Decimals that a row may have beyond the least, so that no interval that excludes 0 seems to include it."""
@@ -588,13 +596,13 @@ def figure_rows(
     """A row of `HEAD` for each policy: mean and paired difference, each with its interval."""
     digits, rows = _digits(list(figures.values()), least_digits), list[tuple[str, ...]]()
     for policy, f in figures.items():
-        cells = (label(policy), f"{f.mean:z.{digits}f}", _span(f.low, f.high, digits))
+        cells = (label(policy), f"{f.mean:z.{digits}f}", _span(f.low, f.high, f.note, digits))
         if policy == baseline:
             rows.append((*cells, "", "", ""))
             continue
         low, high = (round(bound, digits) for bound in (f.difference_low, f.difference_high))
         stars = f.stars if low > 0 or high < 0 else ""
-        rows.append((*cells, f"{f.difference:+z.{digits}f}", _span(low, high, digits, "+"), stars))
+        rows.append((*cells, f"{f.difference:+z.{digits}f}", _span(low, high, f.difference_note, digits, "+"), stars))
     return rows
 
 
@@ -605,7 +613,13 @@ def remarks(figures: Mapping[str, Mapping[str, Figure]], draws: int) -> Iterator
         draws: Independent values that the intervals rest on.
     """
     notes = [note for each in figures.values() for f in each.values() for note in (f.note, f.difference_note)]
-    if any(np.isnan(f.low + f.difference_low) for each in figures.values() for f in each.values()):
+    spans = [
+        pair
+        for each in figures.values()
+        for f in each.values()
+        for pair in ((f.low, f.note), (f.difference_low, f.difference_note))
+    ]
+    if any(np.isnan(low) and note != ONE for low, note in spans):
         most = share_bounds(0, draws)[1]
         yield f"{EQUAL}: no variation in {draws}, at 95 % confidence up to {most:.0%} of all may differ."
     if any(note.endswith("Poisson") for note in notes):
@@ -616,8 +630,10 @@ def remarks(figures: Mapping[str, Mapping[str, Figure]], draws: int) -> Iterator
         yield f"All values at one end of their range, as availability 1: bound of {draws} in {draws} (Clopper–Pearson)."
 
 
-def _span(low: float, high: float, digits: int, sign: str = "") -> str:
-    return EQUAL if np.isnan(low + high) else f"{low:{sign}z.{digits}f} … {high:{sign}z.{digits}f}"
+def _span(low: float, high: float, note: str, digits: int, sign: str = "") -> str:
+    if np.isnan(low + high):
+        return ONE if note == ONE else EQUAL
+    return f"{low:{sign}z.{digits}f} … {high:{sign}z.{digits}f}"
 
 
 def _digits(figures: Sequence[Figure], least: int) -> int:

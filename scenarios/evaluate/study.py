@@ -1,16 +1,20 @@
 """What a study runs: every policy on every instance, fleet, training and seed, with every source of predictions."""
 
 import hashlib
+import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import product
+from modulefinder import ModuleFinder
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError, nearest
+from fleet.fields import MAX_SEED
 from fleet.seeding import child
 from scenarios.evaluate.rollout import FIGURES, DecisionLimit, Outcome, TooSlow
 from scenarios.evaluate.sources import ALL_SOURCES, check_source, drawn, is_trained, preparations
@@ -27,6 +31,8 @@ CARD = "study.json"
 """File of a study with its plan, in the folder of its results."""
 TOGETHER = 16
 """Shifts of a policy that are stepped side by side."""
+OWN_PACKAGES = ("fleet", "agents", "twin", "scenarios", "thermofleet")
+"""Covered by the hash of the code."""
 _LIBRARIES = ("thermofleet", "numpy", "numba", "scipy", "mujoco", "torch")
 
 
@@ -142,6 +148,12 @@ class Study(StudySpec):
         randomise = randomisation_of(self.randomise)
         for case in self.cases:
             randomise.scenarios_of(case.scenario)  # before the first shift, as an error of a late one comes late
+        if self.trainings > 1 and not any(map(is_trained, self.sources)):
+            trained = ", ".join(filter(is_trained, ALL_SOURCES))
+            raise FleetError(
+                f"--trainings {self.trainings} needs predictions of a trained source ({trained}); "
+                f"of {', '.join(self.sources)} there is one."
+            )
         labels: dict[str, str] = {}
         for policy, own in self.own_trainings.items():
             for each in own:
@@ -289,10 +301,32 @@ def policy_hash(name: str) -> str:
     digest = hashlib.sha256()
     for source in sources:
         folder = source if source.is_dir() else source.parent
-        files = sorted(path for path in source.rglob("*") if path.is_file()) if source.is_dir() else [source]
-        for path in files:
-            digest.update(f"{path.relative_to(folder)}\n".encode() + path.read_bytes())
+        for path in files_of(source):
+            digest.update(f"{os.path.relpath(path, folder)}\n".encode() + path.read_bytes())
     return digest.hexdigest()[:16]
+
+
+def files_of(source: Path) -> list[Path]:
+    """All files of a folder; or a file, and what it imports from its folder, its package and the working directory."""
+    if source.is_dir():
+        return sorted(path for path in source.rglob("*") if path.is_file())
+    root = source.absolute().parent
+    while (root / "__init__.py").is_file():
+        root = root.parent
+    inside = source.absolute().relative_to(root)
+    if "site-packages" in root.parts:
+        return sorted((root / inside.parts[0]).rglob("*.py")) or [source]
+    finder = ModuleFinder([str(root), str(Path.cwd())], excludes=OWN_PACKAGES)
+    try:
+        if len(inside.parts) == 1:
+            finder.run_script(str(source))
+        else:
+            finder.import_hook(".".join(inside.with_suffix("").parts).removesuffix(".__init__"))
+    except (SyntaxError, ImportError, ValueError):  # it cannot be loaded either
+        return [source]
+    found = (getattr(module, "__file__", None) for module in finder.modules.values())
+    others = {Path(file).absolute() for file in found if file} - {source.absolute()}
+    return [source, *sorted(others)]
 
 
 def columns(row: Row) -> dict[str, object]:
@@ -320,14 +354,22 @@ def cases_of(names: Sequence[str], seeds: int, first_seed: int = 0) -> list[Case
     Raises:
         FleetError: there is no such scenario, or two have one name.
     """
+    if first_seed + seeds - 1 > MAX_SEED:
+        raise FleetError(f"Seeds are 0..{MAX_SEED}: {seeds} from --first-seed {first_seed} on are too many.")
     cases: list[Case] = []
     for name in names:
         if INSTANCE.fullmatch(name):
+            _check_first(name, first_seed)
             cases.append(_case_of(instance(name), seeds))
         else:
             scenario, own = load(name), tuple(range(first_seed, first_seed + seeds))
             cases.append(Case(name=scenario.name, scenario=scenario, seeds=own))
     return cases
+
+
+def _check_first(name: str, first_seed: int) -> None:
+    if first_seed:
+        raise FleetError(f"'{name}' has seeds of its own: leave --first-seed {first_seed} out.")
 
 
 def _case_of(instance: Instance, seeds: int) -> Case:
@@ -341,14 +383,15 @@ def suite_of(name: str, seeds: int, first_seed: int = 0) -> list[Case]:
         FleetError: there is no such split, instance or scenario.
     """
     if name in SPLITS:
+        _check_first(name, first_seed)
         return [_case_of(each, seeds) for each in split(name)]
     names = [each.strip() for each in name.split(",")]
     for each in names:
+        if each in SPLITS:
+            raise FleetError(f"A split stands alone: give --suite {each}, or instances of it, as {each}/0017.")
         if not (INSTANCE.fullmatch(each) or each in library() or each.endswith(".toml")):
             near = nearest(each, [*SPLITS, *library()])
-            raise FleetError(
-                f"No instances '{each}'{near} An instance of a split is named as test/0017; a split stands alone."
-            )
+            raise FleetError(f"No instances '{each}'{near} An instance of a split is named as test/0017.")
     return cases_of(names, seeds, first_seed)
 
 

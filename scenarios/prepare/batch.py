@@ -34,6 +34,8 @@ def make_batch(
     autoreset: bool = True,
     stagger: bool = False,
     peers: int | None = None,
+    scaled: bool = True,
+    ahead_s: float = 0.0,
     bids: bool = False,
     threads: int = 1,
     progress: Progress = quiet,
@@ -42,7 +44,7 @@ def make_batch(
     """The batched environment of a scenario: `num_envs` shifts side by side in one process.
 
     Args:
-        scenario, difficulty, risk, cache, peers, bids, overrides: As in `make_env`.
+        scenario, difficulty, risk, cache, peers, scaled, ahead_s, bids, overrides: As in `make_env`.
         seed: Env e begins the shift of `seed + e` (or of `seed[e]`): that of `make_env(…).reset(seed=…)`.
         randomise: In addition to what a scenario samples: ambient temperature, arrivals, fleets.
         max_cycles, autoreset, stagger, threads: As in `fleet.env.vector.BatchEnv`.
@@ -57,7 +59,8 @@ def make_batch(
     near = near_of(chosen, peers)
     fleet = prepare(chosen, difficulty=difficulty, risk=risk, randomise=randomise, cache=cache, progress=progress)
     library = replace(library_of(fleet), near=near)
-    options = {"max_cycles": max_cycles, "autoreset": autoreset, "stagger": stagger, "threads": threads, "bids": bids}
+    options = {"max_cycles": max_cycles, "autoreset": autoreset, "stagger": stagger, "threads": threads}
+    options |= {"scaled": scaled, "ahead_s": ahead_s, "bids": bids}
     return BatchEnv(library, num_envs, seed=seed, weights=weights_of(chosen), decisions=chosen.decisions, **options)
 
 

@@ -424,6 +424,8 @@ def make_env(
     render_mode: str | None = None,
     mask_in: "MaskPlace" = "obs",
     peers: int | None = None,
+    scaled: bool = True,
+    ahead_s: float = 0.0,
     bids: bool = False,
     progress: Progress = quiet,
     **overrides: Any,  # one type per field
@@ -441,6 +443,8 @@ def make_env(
         cache: Folder of plans and twins.
         max_cycles, render_mode, mask_in: As in `fleet.env.allocation_v2.AllocationEnv`.
         peers: Number of peers in an arm's observation, the nearest ones; default: all.
+        scaled, ahead_s: As in `fleet.env.vector.BatchEnv`. `thermofleet run` and `compare` give their policies
+            False and infinity.
         bids: Whether an arm observes its peers' predictions for the open jobs.
         overrides: Top-level fields of the scenario to change, for example `horizon_s=600`; Any, as fields differ.
 
@@ -453,7 +457,8 @@ def make_env(
     chosen = scenario_with(scenario, overrides, make_env)
     near = near_of(chosen, peers)
     fleet = prepare(chosen, difficulty=difficulty, risk=risk, randomise=randomise, cache=cache, progress=progress)
-    options = {"max_cycles": max_cycles, "render_mode": render_mode, "mask_in": mask_in, "near": near, "bids": bids}
+    options = {"max_cycles": max_cycles, "render_mode": render_mode, "mask_in": mask_in, "near": near}
+    options |= {"scaled": scaled, "ahead_s": ahead_s, "bids": bids}
     return env_of(fleet, plant=plant, bus=bus, channel=channel, **options)
 
 

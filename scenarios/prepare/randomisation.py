@@ -113,7 +113,7 @@ def randomisation_of(given: object) -> Randomisation:
         ScenarioError: something else was given.
     """
     if not isinstance(given, Randomisation | None):
-        raise ScenarioError(f"randomise must be a scenarios.prepare.fleet.Randomisation (got {given!r}).")
+        raise ScenarioError(f"randomise must be a scenarios.prepare.randomisation.Randomisation (got {given!r}).")
     return given or _NOTHING
 
 

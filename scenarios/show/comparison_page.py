@@ -24,11 +24,6 @@ Array = np.ndarray
 Range = tuple[float, float, float]
 """A value with its lower and upper bound."""
 
-NO_SCORES = (
-    f"No normalised scores: they need {FEWEST} or more shifts with references. Make references with thermofleet "
-    "bounds, then compare with --references FILE."
-)
-NO_SCORES_RANDOMISED = "No normalised scores: references are of shifts without randomisation."
 CHOICE = "Intervals are not adjusted for the choice of the best policy; its significance is (Bonferroni)."
 MOST_CURVES = 8
 """Policies in the chart of profiles: the best ones, and the baseline."""
@@ -62,7 +57,7 @@ def result_text(result: Comparison) -> Group:
         title = f"\nNormalised scores, paired difference to {label(result.baseline)}, {LEGEND}"
         parts += [Text(title), *narrow_score_tables(result.scores), *map(Text, result.scores.remarks)]
     elif result.figures:
-        parts.append(Text(NO_SCORES_RANDOMISED if result.randomise else NO_SCORES))
+        parts.append(Text(_no_scores(result)))
     if illegal := _illegal([result]):
         parts.append(Text(illegal))
     first = {each.policy: each for each in reversed(result.failures)}
@@ -72,6 +67,17 @@ def result_text(result: Comparison) -> Group:
     if replaced := _replaced_baseline(result):
         parts.append(Text(replaced))
     return Group(*parts)
+
+
+def _no_scores(result: Comparison) -> str:
+    """Why a comparison has no normalised scores."""
+    if result.randomise:
+        return "No normalised scores: references are of shifts without randomisation."
+    have = f"{result.referenced or 'none'} of {result.scenario} {'has' if result.referenced < 2 else 'have'} one"
+    return (
+        f"No normalised scores: they need {FEWEST} or more shifts with a reference of the same scenario and seed, and "
+        f"{have}. Make them with thermofleet bounds, then compare with --references FILE."
+    )
 
 
 def _replaced_baseline(result: Comparison) -> str:
@@ -208,10 +214,15 @@ def verdict(judged: Judged) -> list[str]:
     sentences = [f"{label(best)} {'; it '.join(compared)}."] if compared else []
     whose = "Its mean score" if compared else f"The mean score of {label(best)}"
     among = f", the best of {len(scores.policies)} policies" if rest else ""
+    unscored = [each for each in judged.results if each.scores is None and len(judged.results) > 1]
+    scored = [each.scenario for each in judged.results if each.scores is not None]
+    where = f" of {', '.join(scored)}" if unscored else ""
     sentences.append(
         f"{whose} is {scores.policies[best].mean.text()}{among}; random has 0, "
-        f"and the best schedules that a search found for the {scores.instances} instances have {scores.reachable}."
+        f"and the best schedules that a search found for the {scores.instances} instances{where} have "
+        f"{scores.reachable}."
     )
+    sentences += _reward_verdict(unscored)
     sentences += _below({name: (each.difference, each.p_holm) for name, each in scores.policies.items()}, base)
     return [*sentences, *([CHOICE] if compared else []), *last]
 

@@ -519,11 +519,12 @@ def key_figures(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     return tiles
 
 
-def figure_table(shifts: Mapping[str, Mapping[str, Any]], *, wholes: bool = False) -> Table:
+def figure_table(shifts: Mapping[str, Mapping[str, Any]], *, wholes: bool = False, in_file: bool = False) -> Table:
     """Key figures, a column for each shift's metrics by its name, and the second of two minus the first.
 
     Args:
         wholes: Say of what a figure is a part, as in `77 of 87`; without it, cells are plain numbers.
+        in_file: Differences are plain numbers, too.
     """
     columns, rows = [numbers(metrics) for metrics in shifts.values()], list[tuple[str, ...]]()
     for label, name, form, unit, whole in KEY_FIGURES:
@@ -532,17 +533,20 @@ def figure_table(shifts: Mapping[str, Mapping[str, Any]], *, wholes: bool = Fals
             scaled = [values[name] * 100**percent if name in values else None for values in columns]
             of = [f" of {values[whole]:{form}}" if wholes and whole in values else "" for values in columns]
             texts = ["" if each is None else f"{each:{form}}{part}" for each, part in zip(scaled, of, strict=True)]
-            rows.append((str(Column(label, "%" if percent else unit)), *texts, *_difference(scaled, form)))
+            change = _difference(scaled, form, in_file=in_file)
+            rows.append((str(Column(label, "%" if percent else unit)), *texts, *change))
     return Table(head=("", *shifts, *(["difference"] if len(shifts) == 2 else [])), rows=tuple(rows))
 
 
-def _difference(values: Sequence[float | None], form: str) -> list[str]:
+def _difference(values: Sequence[float | None], form: str, *, in_file: bool) -> list[str]:
     """The second value less the first, as the last cell of a row of two; none in other rows."""
     if len(values) != 2:
         return []
     first, second = values
-    change = "" if first is None or second is None else f"{second - first:+{form}}".replace("-", "−")
-    return ["0" if change and not float(change[1:]) else change]
+    if first is None or second is None:
+        return [""]
+    change = f"{second - first:{'' if in_file else '+'}{form}}"
+    return ["0" if not float(change) else change if in_file else change.replace("-", "−")]
 
 
 def _peaks(metrics: Mapping[str, Any]) -> dict[str, float]:
@@ -646,8 +650,12 @@ def other_choices(log: ShiftLog, other: ShiftLog) -> list[str]:
     return lines
 
 
-def runs_table(logs: Mapping[str, ShiftLog]) -> Table:
-    """Settings, outcome and key figures, a column for each run by its name; "" for a figure that a run lacks."""
+def runs_table(logs: Mapping[str, ShiftLog], *, in_file: bool = False) -> Table:
+    """Settings, outcome and key figures, a column for each run by its name; "" for a figure that a run lacks.
+
+    Args:
+        in_file: As of `figure_table`.
+    """
     settings = {
         "scenario": [str(log.card.get("scenario", {}).get("name", "")) for log in logs.values()],
         "policy": [log.policy for log in logs.values()],
@@ -655,7 +663,7 @@ def runs_table(logs: Mapping[str, ShiftLog]) -> Table:
         "predictions": [str(log.card.get("difficulty", "")) for log in logs.values()],
         "outcome": [verdict(log).badge for log in logs.values()],
     }
-    figures = figure_table({name: log.card.get("metrics") or {} for name, log in logs.items()})
+    figures = figure_table({name: log.card.get("metrics") or {} for name, log in logs.items()}, in_file=in_file)
     rows = [(name, *cells, *([""] if len(logs) == 2 else [])) for name, cells in settings.items()]
     return replace(figures, rows=(*rows, *figures.rows))
 

@@ -87,6 +87,10 @@ def test_invalid_seeds_are_refused(make, seed) -> None:
         ({"mask_in": "none"}, r"mask_in must be one of 'obs', 'info', 'both' \(got 'none'\)\."),
         ({"max_cycles": 0}, r"max_cycles must be an integer >= 1 \(got 0\)\."),
         ({"max_cycles": 2.5}, r"max_cycles must be an integer >= 1 \(got 2\.5\)\."),
+        ({"scaled": "no"}, r"scaled must be True or False \(got 'no'\)\."),
+        ({"ahead_s": -1}, r"ahead_s must be a number of seconds >= 0, or inf \(got -1\)\."),
+        ({"ahead_s": float("nan")}, r"ahead_s must be a number of seconds >= 0, or inf \(got nan\)\."),
+        ({"ahead_s": "1"}, r"ahead_s must be a number of seconds >= 0, or inf \(got '1'\)\."),
     ],
 )
 def test_invalid_options_are_refused(make, options, message) -> None:
@@ -258,7 +262,7 @@ def test_options_of_wrong_type_are_refused_with_the_valid_type(cell, plans) -> N
         with pytest.raises(ScenarioError, match=r"scenario must be a library name, .+ \(got 0\.3\)"):
             make(wrong)
     with pytest.raises(
-        ScenarioError, match=r"randomise must be a scenarios\.prepare\.fleet\.Randomisation \(got 0\.3\)"
+        ScenarioError, match=r"randomise must be a scenarios\.prepare\.randomisation\.Randomisation \(got 0\.3\)"
     ):
         make_batch(cell, 2, difficulty="blind", cache=plans, randomise=wrong)
 

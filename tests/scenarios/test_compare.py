@@ -444,8 +444,9 @@ least_difficulty@rc
 def test_sources_have_the_rewards_that_they_always_had(thermofleet, small_toml, tmp_path, twin, expected) -> None:
     """Equal up to the rounding of energies in float32."""
     small_toml.write_text(small_toml.read_text() + twin)
-    how = ("--fleets", 2, "--trainings", 2, "--seeds", 2, "--first-seed", 10_000, "--out", tmp_path / "out")
-    thermofleet("compare", small_toml, "--policies", ",".join(expected), *how).succeeded()
+    how = ("--fleets", 2, "--seeds", 2, "--first-seed", 10_000, "--out", tmp_path / "out")
+    trainings = ("--trainings", 2) if twin else ()
+    thermofleet("compare", small_toml, "--policies", ",".join(expected), *how, *trainings).succeeded()
     found: dict[str, list[float]] = {}
     for row in read_rows(tmp_path / "out"):
         assert row.outcome is not None
@@ -458,9 +459,9 @@ def test_sources_have_the_rewards_that_they_always_had(thermofleet, small_toml, 
 @pytest.mark.ci_slow
 def test_a_comparison_of_sources_resumes(thermofleet, small_toml, tmp_path, monkeypatch) -> None:
     out = tmp_path / "sources"
-    how = ("--fleets", 2, "--trainings", 2, "--first-seed", 10_000, "--workers", 1)
+    how = ("--fleets", 2, "--first-seed", 10_000, "--workers", 1)
     names = ("--policies", "wspt,round_robin@blind", "--difficulty", "blind,rc-nominal,random,oracle")
-    call = ("compare", small_toml, *names, *how, "--out", out)
+    call = ("compare", small_toml, *names, *how, "--trainings", 2, "--out", out)
     done = thermofleet(*call, "--seeds", 2).succeeded()
     for name in ("wspt@blind", "wspt@rc-nominal", "wspt@random", "wspt@oracle", "round_robin@blind"):
         assert done.out.count(f"  {name} ") == 1 + len(FIGURES)  # its scope, and each figure
@@ -475,6 +476,27 @@ def test_a_comparison_of_sources_resumes(thermofleet, small_toml, tmp_path, monk
     monkeypatch.setattr(runner, "run_unit", lambda unit, settings: units.append(unit) or real(unit, settings))
     thermofleet(*call, "--seeds", 3).succeeded()
     assert [unit.case.seeds for unit in units] == [(10_002,)] * 12
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ("compare quickstart --difficulty blind --trainings 3", "needs predictions of a trained source (twin, trained"),
+        ("compare --suite test/0001 --first-seed 5", "'test/0001' has seeds of its own: leave --first-seed 5 out."),
+        ("compare --suite test --first-seed 5", "'test' has seeds of its own"),
+        (
+            "compare --suite test,validation",
+            "A split stands alone: give --suite test, or instances of it, as test/0017",
+        ),
+        ("compare quickstart --first-seed 4294967295 --seeds 3", "3 from --first-seed 4294967295 on are too many"),
+        ("bounds quickstart --show", "--show prints all rows of the file: leave the scenarios and --suite out."),
+        ("leaderboard --split train", "Allowed: test, validation."),
+    ],
+)
+def test_options_that_would_have_no_effect_are_refused(thermofleet, arguments, told) -> None:
+    name, *rest = arguments.split()
+    more = ("--policies", "wspt") if name == "compare" else ()
+    assert thermofleet(name, *rest, *more).refused(told)
 
 
 def test_bad_sources_are_named(thermofleet, small_toml) -> None:

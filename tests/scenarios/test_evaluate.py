@@ -1,5 +1,6 @@
 """Figures, scores and the oracle of a shift, against the shift run alone and integrated heat."""
 
+import json
 import math
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.difficulty import KNOWN
 from fleet.engine.shift import initial, step
 from fleet.engine.world import warm_start
+from fleet.errors import FleetError
 from fleet.heat.motor import gen3_motors
 from fleet.heat.thermal import NODES, WINDING, drive_heat, gen3_network, node_heat, steady_state, thermal_model
 from fleet.motion import Plan, drive
@@ -295,6 +297,41 @@ def test_a_file_of_references_counts_for_the_same_scenario_only():
     case = Case(name="heat_wave", scenario=wave, seeds=(100, 104, 105))
     assert sorted(seed for _, seed in references_of([case], file)) == [100, 104]
     assert not references_of([replace(case, scenario=replace(wave, slots=wave.slots + 1))], file)
+
+
+def test_of_several_references_of_a_shift_that_with_the_compared_predictions_counts(tmp_path):
+    """In whatever order; their zeros differ. An older row of another scenario hides none."""
+    file = Path(__file__).parents[2] / "docs" / "results" / "bounds_library.jsonl"
+    lines = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+    row = next(each for each in lines if each["instance"] == "heat_wave/100")
+    blind = row | {"difficulty": "blind", "key": "blind", "random": row["random"] - 5.0}
+    stale = row | {"scenario_hash": "0" * 16, "key": "stale", "random": 0.0}
+    case = Case(name="heat_wave", scenario=load("heat_wave"), seeds=(100,))
+    for order in ((row, blind, stale), (stale, blind, row)):
+        (tmp_path / "rows").write_text("".join(json.dumps(each) + "\n" for each in order), encoding="utf-8")
+        for source, random in ((row["difficulty"], row["random"]), ("blind", blind["random"])):
+            (found,) = references_of([case], tmp_path / "rows", [source]).values()
+            assert found.random == random
+        for sources in ([], ["twin"], ["blind", row["difficulty"]]):
+            with pytest.raises(FleetError, match=r"has references of heat_wave/100 with several --difficulty \("):
+                references_of([case], tmp_path / "rows", sources)
+
+
+def test_a_policy_that_declares_to_read_no_messages_cannot_read_them(scenario, plans, tmp_path):
+    """Otherwise it would see all of them on a channel that loses most."""
+    body = "    def reset(self, rng): pass\n    def choose(self, seen, place): return int(seen.{} is None)\n"
+    for name, field in (("fleet", "fleet_busy_s"), ("peer", "peer_working"), ("own", "busy_s")):
+        text = f"class Deaf:\n    scope, reads_messages = 'arm', False\n{body.format(field)}"
+        (tmp_path / f"{name}.py").write_text(text, encoding="utf-8")
+    fleet = prepare(scenario, difficulty="blind", cache=plans)
+    assert outcomes(fleet, f"{tmp_path / 'own.py'}:Deaf", [0], LATE)
+    for name, field in (("fleet", "fleet_busy_s"), ("peer", "fleet_working")):
+        policy = f"{tmp_path / name}.py:Deaf"
+        said = f"declares reads_messages = False, but reads {field}, which its peers send"
+        with pytest.raises(PolicyFailed, match=said):
+            outcomes(fleet, policy, [0], LATE)
+        with pytest.raises(PolicyFailed, match=said):
+            run(fleet, RunSpec(policy=policy, difficulty="blind", channel=LATE, bus="memory"))
 
 
 MOTORS, THERMAL = gen3_motors(), thermal_model(gen3_network())

@@ -152,6 +152,54 @@ def test_policies_that_fail_are_told_and_the_others_go_on(scenario, plans, bad, 
     assert f"The baseline {label(names['Raises'])} failed: differences are to round_robin." in shown.getvalue()
 
 
+def test_failed_shifts_are_run_again_and_no_others(scenario, plans, tmp_path):
+    """The cause may have been outside of the policy."""
+    policy = tmp_path / "needs.py"
+    policy.write_text(
+        "class Needs:\n    scope = 'central'\n    def reset(self, rng): pass\n"
+        f"    def act(self, seen):\n        open({str(tmp_path / 'file')!r}).close()\n        return {{}}\n",
+        encoding="utf-8",
+    )
+    study, told = study_of(scenario, "random", f"{policy}:Needs", seeds=2), list[str]()
+
+    def failed():
+        rows = runner.run_study(study, out=tmp_path / "out", cache_dir=plans, workers=1, tell=told.append)
+        return [row.error is not None for row in rows]
+
+    assert failed() == [False, False, True, True]
+    (tmp_path / "file").touch()
+    assert failed() == [False] * 4
+    assert failed() == [False] * 4
+    assert told == ["Running again what failed before: 2 shifts."]
+    assert not any(row.error for row in read_rows(tmp_path / "out"))
+
+
+@pytest.mark.parametrize("is_package", [False, True])
+def test_a_policy_is_another_one_when_what_it_imports_has_changed(tmp_path, monkeypatch, is_package):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    name = f"pol_{is_package}"
+    folder = tmp_path / name if is_package else tmp_path
+    folder.mkdir(exist_ok=True)
+    (folder / "helper.py").write_text("import numpy\nfrom agents.policy import WAIT\n", encoding="utf-8")
+    (folder / "other.py").write_text("", encoding="utf-8")
+    if is_package:
+        (folder / "__init__.py").write_text("from .impl import Mine\n", encoding="utf-8")
+        (folder / "impl.py").write_text("from . import helper\nclass Mine: pass\n", encoding="utf-8")
+    else:
+        (folder / f"{name}.py").write_text("import helper\nclass Mine: pass\n", encoding="utf-8")
+    policy = f"{name}:Mine" if is_package else f"{name}.py:Mine"
+    hashes = [policy_hash(policy)]
+    for changed in ("other.py", "helper.py"):
+        with (folder / changed).open("a", encoding="utf-8") as file:
+            file.write("x = 1\n")
+        hashes.append(policy_hash(policy))
+    assert hashes[0] == hashes[1] != hashes[2]
+    if not is_package:
+        (folder / "helper.py").write_text("def (", encoding="utf-8")
+        assert policy_hash(policy)  # what cannot be loaded is told elsewhere
+
+
 @pytest.mark.ci_slow
 def test_a_policy_that_catches_every_alarm_ends_with_its_process():
     code = """

@@ -322,6 +322,14 @@ def test_a_baseline_differs_by_nothing_and_cells_without_variation_say_so(paired
     )
 
 
+def test_a_single_value_has_no_interval_and_says_so():
+    single = {policy: {"value": np.array([x])} for policy, x in (("base", 2.0), ("other", 5.0))}
+    found = figures_of(single, "base", {"value": FigureKind("value")})
+    rows = figure_rows({policy: each["value"] for policy, each in found.items()}, "base", str)
+    assert rows[1] == ("other", "5.0", "one value", "+3.0", "one value", "")
+    assert list(remarks(found, 1)) == []
+
+
 THRESHOLDS = np.linspace(0.0, 1.0, 5)
 
 

@@ -114,6 +114,23 @@ def test_a_damaged_run_is_refused_in_words(run_folder: Path, tmp_path: Path, dam
         open_run(copied)
 
 
+def test_a_page_is_no_table_and_a_comparison_no_run(run_folder: Path, tmp_path: Path, capsys) -> None:
+    (tmp_path / "study").mkdir()
+    (tmp_path / "study" / "study.json").write_text("{}", encoding="utf-8")
+    wrong = [
+        (["report", str(run_folder), "--out", str(tmp_path / name)], "--out must end in .html (got")
+        for name in ("r.csv", "r.xlsx", "r")
+    ]
+    wrong.append(
+        (["report", str(tmp_path / "study")], "is of `thermofleet compare`: open its index.html in a browser.")
+    )
+    for arguments, told in wrong:
+        with pytest.raises(SystemExit) as ended:
+            main(arguments)
+        assert ended.value.code == 2
+        assert told in " ".join(capsys.readouterr().err.split())
+
+
 def test_the_report_written_anew_is_the_same(run_folder: Path, tmp_path: Path, thermofleet) -> None:
     thermofleet("report", run_folder, "--out", tmp_path / "again.html")
     assert (tmp_path / "again.html").read_bytes() == (run_folder / "report.html").read_bytes()
