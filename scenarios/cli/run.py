@@ -80,7 +80,7 @@ def run_command(
         progress = open_until_end.enter_context(progress_bar())
         _, result = _run_into(chosen, spec, where, overwrite, progress, endpoint=endpoint)
     if as_json:
-        keys = ("status", "policy", "seed", "plant", "bus", "difficulty", "metrics")
+        keys = ("status", "policy", "seed", "plant", "bus", "difficulty", "reward", "metrics")
         print_json({"out": str(where), **{key: result.card[key] for key in keys}})
     else:
         say(f"{chosen.name}, seed {spec.seed}", out_console)

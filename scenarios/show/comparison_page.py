@@ -64,8 +64,6 @@ def result_text(result: Comparison) -> Group:
     for policy, count in Counter(each.policy for each in result.failures).most_common(MOST_TRACES):
         shifts = f"{label(policy)} failed in {count} shift{'s' * (count > 1)}, first in"
         parts.append(Text(f"\n{shifts} {_failure_text(first[policy])}\n{first[policy].trace}".rstrip()))
-    if replaced := _replaced_baseline(result):
-        parts.append(Text(replaced))
     return Group(*parts)
 
 
@@ -84,8 +82,9 @@ def _replaced_baseline(result: Comparison) -> str:
     """That the baseline failed, and which policy takes its place; "" if it did not."""
     if not result.failed_baseline:
         return ""
-    instead = f"differences are to {label(result.baseline)}" if result.figures else "as every policy did"
-    return f"The baseline {label(result.failed_baseline)} failed: {instead}."
+    if not result.figures:
+        return "Every policy failed."
+    return f"The baseline {label(result.failed_baseline)} failed: differences are to {label(result.baseline)}."
 
 
 def _illegal(results: Sequence[Comparison]) -> str:

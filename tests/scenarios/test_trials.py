@@ -3,13 +3,11 @@
 import subprocess
 import sys
 from dataclasses import replace
-from io import StringIO
 
 import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from rich.console import Console
 
 from agents.pairs import PARAMETERS, save_pairs
 from fleet.errors import FleetError
@@ -23,7 +21,7 @@ from scenarios.prepare import fleet as preparing
 from scenarios.prepare.arms import plan_arms
 from scenarios.prepare.fleet import prepare
 from scenarios.processes import Queue
-from scenarios.show.comparison_page import result_text
+from scenarios.show.comparison_page import Judged, verdict
 from scenarios.spec.parse import override
 from scenarios.spec.schema import Scenario
 
@@ -147,9 +145,8 @@ def test_policies_that_fail_are_told_and_the_others_go_on(scenario, plans, bad, 
     (again,) = comparisons(study, rows, names["Raises"])  # which failed: the first that did not takes its place
     assert (again.baseline, again.failed_baseline) == ("round_robin", names["Raises"])
     assert replace(again, failed_baseline="") == result
-    shown = StringIO()
-    Console(file=shown, width=200).print(result_text(again))
-    assert f"The baseline {label(names['Raises'])} failed: differences are to round_robin." in shown.getvalue()
+    told = verdict(Judged(title="", results=[again], values=None, card=study.card, command=""))
+    assert f"The baseline {label(names['Raises'])} failed: differences are to round_robin." in told
 
 
 def test_failed_shifts_are_run_again_and_no_others(scenario, plans, tmp_path):
