@@ -6,7 +6,7 @@ arms that are idle at home take no space; requests of people have their effect (
 result once (`recording`).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from benchmarks.simulation.participants import AUCTIONEER, CLIENT, Watch, simulated_system
@@ -461,28 +461,30 @@ def redo_early(shift: Shift, tries: int = 100) -> None:
     if early := [(name, job) for name, job in ready if not shift.begun.get(job)]:
         name, job = early[0]
         _cut(shift, {name: 1}, 14.0)
-        shift.world.after(9.0, request, shift, Settle(job, "redo"), lambda: not shift.begun.get(job))
+        shift.world.after(9.0, request, shift, Settle(job, "redo"))
     elif tries:
         shift.world.after(0.2, redo_early, shift, tries - 1)
 
 
-def request(shift: Shift, action: Action, wanted: Callable[[], object] = lambda: True) -> None:
+def request(shift: Shift, action: Action) -> None:
     """Send a request of a person, again until there is a reply or the fleet is healed; and sometimes once more.
 
-    Args:
-        wanted: Whether the person still has a reason for it.
+    A job is not to be redone once its last cycle was begun.
     """
-    if not wanted():
+    redone = action.job if isinstance(action, Settle) and action.outcome == "redo" else ""
+    if shift.begun.get(redone):
         return
     if isinstance(action, Cancel):
         shift.cancelled.add(action.job)
-    elif isinstance(action, Settle) and action.outcome == "redo":
-        shift.redone.add(action.job)
+    elif redone:
+        shift.redone.add(redone)
     message = ControlRequest(str(shift.world.now_s), action, "a person")
     shift.world.log("person", f"requests {action}")
     link: Any = shift.world.processes[CLIENT].client
 
     def send() -> None:
+        if shift.begun.get(redone):
+            return
         link.query(keys.of_jobs("f", "control"), message, Controlled, done, timeout_s=2.0)
 
     def done(replies: Any) -> None:
