@@ -167,6 +167,8 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
     """Names of the spaces that are closed to other arms, by arm, from the last status reply."""
     paused: dict[str, str] = {}
     """Who paused an arm, by arm, from the last status reply; "*" for all arms."""
+    left_out: dict[str, str] = {}
+    """Why an arm is awarded no job for a while, by arm, from the last status reply."""
     speed: float | None = None
     """Fleet seconds per real second."""
     changes: dict[str, int] = {}
@@ -258,6 +260,7 @@ class FleetView:
     _auctioneers: "Recent[str, _Auctioneer]" = field(default_factory=lambda: Recent(MAX_NAMES))
     _space: dict[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
     _paused: dict[str, str] = field(default_factory=dict[str, str])
+    _left_out: dict[str, str] = field(default_factory=dict[str, str])
     _jobs: "Recent[str, _Job]" = field(
         default_factory=lambda: Recent(MAX_JOBS, lambda job: job.status.state not in ENDED)
     )
@@ -303,7 +306,7 @@ class FleetView:
             for job in self._jobs.values():
                 job.number = 0
         auctioneer.heard_s, auctioneer.time_s, auctioneer.trouble = now_s, reply.time_s, reply.trouble
-        self._space, self._paused = dict(reply.space), dict(reply.paused)
+        self._space, self._paused, self._left_out = dict(reply.space), dict(reply.paused), dict(reply.left_out)
         for status in reply.jobs:
             self._set_status(status, now_s)
 
@@ -337,15 +340,14 @@ class FleetView:
             jobs=tuple(statuses[-jobs:]) if jobs > 0 else (),
             space=self._space,
             paused=dict(self._paused),
+            left_out=dict(self._left_out),
             speed=self.speed,
             alarms=tuple(self.alarms.values()),
             listened_s=_age_s(self.began_s, now_s) or 0.0,
             lost_s=_age_s(self.lost_s, now_s),
         )
         unserved = why_unserved(now)
-        return replace(
-            now, arms=tuple(replace(arm, idle=why_idle(arm, waiting, self._paused, unserved)) for arm in now.arms)
-        )
+        return replace(now, arms=tuple(replace(arm, idle=why_idle(arm, waiting, now, unserved)) for arm in now.arms))
 
     def _pause(self, request: ControlRequest) -> None:
         """Apply a pause or its end, which the next status reply confirms."""
@@ -485,26 +487,28 @@ def why_unserved(fleet: FleetSnapshot) -> str:
     return next((each.trouble for each in fleet.auctioneers if each.trouble and each.auctioneer == last), "")
 
 
-def why_idle(arm: ArmSnapshot, waiting: Mapping[str, str], paused: Mapping[str, str], unserved: str = "") -> str:
+def why_idle(arm: ArmSnapshot, waiting: Mapping[str, str], fleet: FleetSnapshot, unserved: str = "") -> str:
     """Why an arm has no job now; "" for one that has a job or is not present.
 
     Args:
         waiting: Reasons of the waiting jobs, by job.
-        paused: As in a snapshot.
+        fleet: Which arms are paused or left out.
         unserved: Why no arm gets a job.
     """
     if not arm.present or arm.job:
         return ""
-    if (pause := next((name for name in (ALL_ARMS, arm.arm) if name in paused), None)) is not None:
-        return f"It is paused{by_whom(paused[pause])}."
+    if (pause := next((name for name in (ALL_ARMS, arm.arm) if name in fleet.paused), None)) is not None:
+        return f"It is paused{by_whom(fleet.paused[pause])}."
     if arm.mode == "faulted":
         return "It is faulted."
     if arm.break_end_s is not None:
         return f"It is in a break until {timedelta(seconds=round(arm.break_end_s))} of fleet time."
     if arm.headroom_k is not None and arm.headroom_k <= 0.0:
-        return "It is above its warning limit."
+        return "Its temperatures are impossible." if arm.bad_sensor else "It is above its warning limit."
     if unserved:
         return unserved
+    if arm.arm in fleet.left_out:
+        return f"It {fleet.left_out[arm.arm]}."
     if not waiting:
         return "No job waits."
     named = next((f" {job}: {reason}" for job, reason in waiting.items() if arm.arm in reason), "")

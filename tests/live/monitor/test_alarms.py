@@ -157,6 +157,7 @@ def test_findings_without_a_kind_raise_no_alarm():
         ({}, {}, {"*": "ann"}, "It is paused by 'ann'."),
         ({"mode": "faulted"}, {}, {}, "It is faulted."),
         ({"headroom_k": -1.0}, {"j": "x"}, {}, "It is above its warning limit."),
+        ({"temp_c": (30.0, -300.0, 40.0), "headroom_k": -1.0}, {"j": "x"}, {}, "Its temperatures are impossible."),
         ({}, {}, {}, "No job waits."),
         (
             {},
