@@ -327,7 +327,7 @@ def space_line(fleet: FleetSnapshot) -> Text:
         arm = arms.get(name)
         where = "not present"
         if arm is not None and arm.present:
-            where = "away from home" if arm.away else "has a job" if arm.job else "as it quotes"
+            where = "away from home" if arm.away else "has a job" if arm.job else "has no job"
         parts.append(f"{name} ({where}{', may be anywhere' if ANYWHERE in spaces else ''})")
     return _line(f"space closed by: {', '.join(parts) or _none(fleet)}")
 

@@ -49,7 +49,7 @@ def test_an_absent_arm_that_keeps_its_space_is_a_warning():
 
 def test_an_idle_arm_that_quotes_space_is_not_said_to_have_a_job():
     now = msgspec.structs.replace(fleet(arm(), arm(arm="b", job="j")), space={"a": ("s",), "b": ("t",)})
-    assert space_line(now).plain == "space closed by: a (as it quotes), b (has a job)"
+    assert space_line(now).plain == "space closed by: a (has no job), b (has a job)"
 
 
 def faults(now, *probes, **more):
