@@ -205,7 +205,8 @@ def check_connection(fleet: FleetSnapshot) -> list[Finding]:
     """Check that the listener has a connection to the router: without one a snapshot shows an earlier fleet."""
     if fleet.lost_s is None:
         return []
-    lost = "The connection to the router is lost: the router has ended, or is unreachable. What is shown is from before"
+    why = fleet.expiry.rstrip(".") or "The connection to the router is lost: the router has ended, or is unreachable"
+    lost = f"{why}. What is shown is from before"
     what = f"{lost}, {fleet.lost_s:.0f} s ago."
     return [Finding("fault", what, "connection", since_s=fleet.lost_s, lasting=f"{lost}.")]
 
@@ -341,6 +342,10 @@ def check_arm(arm: ArmSnapshot, offset_s: float | None, *, malformed: bool = Fal
         problem = f"is stale, with a last state {age_s:.1f} s old: {cause}"
     absent = f"{arm.arm} is absent: it has left, or its process hangs or has ended."
     findings = [Finding("fault", f"{arm.arm} {problem}", "absent", arm.arm, lasting=absent)] if problem else []
+    if arm.doubled:
+        findings.append(
+            Finding("fault", f"Two processes publish as arm {arm.arm}: its ticks go back and forth. Stop one.")
+        )
     if arm.mode == "faulted":
         hot = f"{arm.arm} is faulted: joint {arm.joint} is at {arm.hottest_c:.1f} °C."
         findings.append(Finding("warning", hot, "fault", arm.arm))
