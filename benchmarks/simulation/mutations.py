@@ -26,7 +26,7 @@ from fleet.live.consensus.grants import Claimant, Granter
 from fleet.live.job_rules import PastJobs, content_hash
 from fleet.live.journal import CommitPermitted, JobsAccepted, Journal, Released
 from fleet.live.leases import Timing
-from fleet.live.records import Granted, JobSettled, Requested
+from fleet.live.records import CountedLease, Granted, JobSettled, Requested
 from fleet.live.supervisor import Supervisor
 from scenarios.live.recorder import GapFetcher, Recorder
 
@@ -137,11 +137,11 @@ def _silent(report: Any) -> Any:
 def _expires_all(expire: Any) -> Any:
     """Take a job back although its arm was permitted to commit."""
 
-    def patched(book: Any, real_s: float, time_s: float) -> bool:
+    def patched(book: Any, real_s: float, time_s: float) -> list[CountedLease]:
         for name in [name for name, lease in book.leases.items() if real_s >= lease.until_s]:
             grant = book.open[name].record
             book.record(Released(name, grant.job, grant.arm, "dropped", 0, time_s, "mutation"))
-        return False
+        return []
 
     return patched
 
@@ -271,7 +271,7 @@ add_mutation(
 add_mutation(
     "no-backstop",
     "an unanswered award is sent again, or expires",
-    (auctioneer_module, "expire", lambda _: lambda book, real_s, time_s: False),
+    (auctioneer_module, "expire", lambda _: lambda book, real_s, time_s: []),
     alone=False,
 )
 

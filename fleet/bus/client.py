@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from functools import lru_cache, partial
 from typing import Any, Generic, Self, TypeVar, TypeVarTuple
 
@@ -27,7 +28,7 @@ from fleet.bus.protocol.keys import BusChannel, Pattern, channel_for, channel_of
 from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, check_name, decode, encode, encoding
 from fleet.bus.router import Connection
 from fleet.bus.security.access_control import RosterEntry, rights_by_role
-from fleet.bus.security.tls import participant_at
+from fleet.bus.security.tls import expires_at, participant_at
 from fleet.errors import BusError, Refused, RefusedForNow
 
 _LOG = logging.getLogger(__name__)
@@ -150,6 +151,8 @@ class BusClient(Connection):
         self.overrun = 0
         self._calls: Mailbox[tuple[Callable[..., None], tuple[Any, ...]]] = Mailbox(backlog)
         self._participant: RosterEntry | None = None
+        self._expires: datetime | None = None
+        self._expiry_logged = False
 
     def open(self) -> Self:
         """Connect.
@@ -160,12 +163,23 @@ class BusClient(Connection):
         if self._session is None:
             super().open()
             self._participant = participant_at(self._endpoint)
+            self._expires = expires_at(self._endpoint)
         return self
 
     @property
     def participant(self) -> str:
         """Its name in the roster of the keys with which it is connected; "" without one."""
         return "" if self._participant is None else self._participant.name
+
+    @property
+    def expiry(self) -> str:
+        """Sentence that its certificate has expired; "" if it has not, and without TLS."""
+        if self._expires is None or datetime.now(UTC) < self._expires:
+            return ""
+        return (
+            f"The certificate of '{self.participant}' expired on {self._expires:%Y-%m-%d %H:%M} UTC, so it has no "
+            "connection: renew it with thermofleet bus keys --add, and start this process again."
+        )
 
     def close(self) -> None:
         """Disconnect; messages that were not handled are dropped. May be called twice."""
@@ -182,6 +196,9 @@ class BusClient(Connection):
 
         Returns how many it handled. Waking once for many messages costs much less than once for each.
         """
+        if not self._expiry_logged and (expiry := self.expiry):
+            self._expiry_logged = True
+            _LOG.error("%s", expiry)
         handled = 0
         for handle, arguments in self._calls.take(until_s, count=at_least):
             handle(*arguments)

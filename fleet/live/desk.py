@@ -2,7 +2,7 @@
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import TypeVar
 
 from msgspec import Struct
@@ -76,6 +76,10 @@ class JobDesk(ABC):
     def _trouble(self) -> str:
         """Return why this participant accepts and awards no jobs; "" if it does."""
 
+    def _left_out(self) -> Mapping[str, str]:
+        """Return why some arms are awarded no jobs for a while, by arm."""
+        return {}
+
     @abstractmethod
     def _statuses(self, names: tuple[str, ...]) -> Iterable[JobStatus]: ...
     @abstractmethod
@@ -88,7 +92,7 @@ class JobDesk(ABC):
     def _reply_status(self, request: StatusRequest) -> Status:
         self._check_first()
         book, statuses = self.book, self._statuses(request.jobs)
-        known = book.taken_space(), book.epoch, book.operations.paused, self._trouble()
+        known = book.taken_space(), book.epoch, book.operations.paused, self._trouble(), self._left_out()
         return status_reply(self._name, self.time_s, statuses, *known)
 
     def _reply_cell(self, _: CellRequest) -> Cell:

@@ -331,6 +331,7 @@ def status_reply(
     epoch: str = "",
     paused: Mapping[str, str] = NONE,
     trouble: str = "",
+    left_out: Mapping[str, str] = NONE,
 ) -> Status:
     """Return the reply to a status request.
 
@@ -340,9 +341,10 @@ def status_reply(
         name: Name of the replier.
         taken: Names of the spaces that each arm may take.
         trouble: Why the replier accepts and awards no jobs; "" if it does.
+        left_out: As in the reply.
     """
     kept, space = list(statuses), {arm: tuple(sorted(names)) for arm, names in sorted(taken.items()) if names}
-    reply = Status(name, time_s, (), space, epoch, dict(paused), trouble)
+    reply = Status(name, time_s, (), space, epoch, dict(paused), trouble, dict(left_out))
     if len(kept) > MOST_JOBS:
         kept = sorted(kept, key=lambda status: status.state in SETTLED)[:MOST_JOBS]
     sizes = accumulate((len(encode(status)) + 1 for status in kept), initial=len(encode(reply)))

@@ -30,6 +30,9 @@ class Timing:
     """Maximum number of times that an award is sent."""
     pause_s: tuple[float, float] = (0.25, 2.0)
     """Between rounds in which nothing was awarded: the first pause and the longest."""
+    refused_s: tuple[float, float] = (1.0, 32.0)
+    """Before an arm is awarded a job again that it refused, or whose award it did not answer: the first pause and the
+    longest."""
     max_jobs: int = 64
     """Jobs in one round; a quote for more would be a large message."""
 
@@ -37,8 +40,10 @@ class Timing:
         for name in ("lease_s", "margin_s", "window_s", "ack_s", "attempts", "max_jobs"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"Timing.{name} must be > 0 (got {getattr(self, name)}).")
-        if not 0 < self.pause_s[0] <= self.pause_s[1]:
-            raise ValueError(f"Timing.pause_s must be 0 < first <= longest (got {self.pause_s}).")
+        for name in ("pause_s", "refused_s"):
+            first_s, longest_s = getattr(self, name)
+            if not 0 < first_s <= longest_s:
+                raise ValueError(f"Timing.{name} must be 0 < first <= longest (got {getattr(self, name)}).")
 
     @property
     def counted_lease_s(self) -> float:
@@ -61,9 +66,9 @@ def send_again(leases: Mapping[str, CountedLease], real_s: float, timing: Timing
     return due
 
 
-def expire(book: JobBook, real_s: float, time_s: float) -> bool:
-    """Record the ends of leases; return whether a job goes back. One in its last cycle stays with its arm."""
-    back = False
+def expire(book: JobBook, real_s: float, time_s: float) -> list[CountedLease]:
+    """Record the ends of leases; return those of the jobs that go back. One in its last cycle stays with its arm."""
+    back: list[CountedLease] = []
     for award, lease in [(award, lease) for award, lease in book.leases.items() if real_s >= lease.until_s]:
         grant = book.open[award]
         job, arm = grant.record.job, grant.record.arm
@@ -71,16 +76,21 @@ def expire(book: JobBook, real_s: float, time_s: float) -> bool:
         if not grant.may_commit:
             missing = "renew its lease" if lease.unanswered is None else "answer the award"
             reason = f"'{arm}' did not {missing}."
-            if real_s > lease.until_s + STOPPED_S:  # it may have tried
+            if was_stopped(lease, real_s):  # the arm may have tried
                 reason = f"The lease of '{arm}' ended while nobody could renew it: the process that awards was stopped."
             if not book.try_to_record(vain, Released(award, job, arm, "dropped", lease.cycles, time_s, reason)):
                 return back
-            back = True
+            back.append(lease)
         elif not (grant.silent or book.ended) and not book.try_to_record(
             vain, ContactLost(award, time_s, lease.cycles)
         ):
             return back
     return back
+
+
+def was_stopped(lease: CountedLease, real_s: float) -> bool:
+    """Return whether this process was stopped when a lease ended, by the real second at which it notices the end."""
+    return real_s > lease.until_s + STOPPED_S
 
 
 def renewal(book: JobBook, award: str, time_s: float, cycles: int, *, finishing: bool) -> list[BookRecord]:

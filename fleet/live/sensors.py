@@ -39,6 +39,11 @@ class ArmSensors:
         """Sentence on the impossible temperatures of the last state; "" without any."""
         return "; ".join(self._filter.bad[joint] for joint in sorted(self._filter.bad))
 
+    @property
+    def why_unfit(self) -> str:
+        """Why the arm gets no jobs, after its name; "" if its temperatures leave headroom, or are possible."""
+        return "has impossible temperatures" if self._filter.bad and self._headroom_k <= 0 else ""
+
     def check(self, state: State) -> State:
         """The state with a possible temperature of every motor, and the headroom that is left in any case.
 

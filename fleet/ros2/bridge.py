@@ -21,9 +21,10 @@ from fleet.bus.protocol.auction import Ack, Award, JobEstimate, Quote, QuoteRequ
 from fleet.bus.protocol.messages import DifficultyScores, Info, MalformedMessage, State
 from fleet.errors import BusError, RefusedForNow
 from fleet.live.arm.body import MotionMonitor
-from fleet.live.arm.node import WARNING_S, ClockSync, RateLimitedWarnings
+from fleet.live.arm.node import ClockSync
 from fleet.live.clock import FleetClock
 from fleet.live.monitor.snapshot import Recent
+from fleet.live.rate_limit import WARNING_S, RateLimitedWarnings
 from fleet.readings import TemperatureFilter
 from fleet.robot import ThermalLimits, half_turn
 from fleet.ros2.cdr import (

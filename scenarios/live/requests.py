@@ -56,7 +56,9 @@ PATIENCE_S = 30.0
 """Real seconds without a reply after which following ends."""
 MOST_CHARACTERS = 128
 """Longest name of a person."""
-_NEEDS_ROLE = "With TLS, use a certificate of the role operator."
+_NEEDS_ROLE = (
+    "With TLS, use a certificate of the role operator that the router knows: it reads its roster when it starts."
+)
 _UNKNOWN_KIND = re.compile(r"Invalid enum value '(.*)'", re.DOTALL)
 """Message of msgspec; of all fields of a job, only its kind is an enumeration."""
 Decoded = TypeVar("Decoded")

@@ -28,6 +28,9 @@ from scenarios.terminal import echo, err_console, out_console, print_wide, say
 
 WAIT_S, GONE_S = 0.5, 3.0
 """Real seconds between two searches for a fleet, and without participants until a settled shift counts as ended."""
+LEFT_S, RESTORED_S = 1.0, 10.0
+"""Real seconds without participants after which a lost connection is no reason for it, and after a connection was
+restored until they are back."""
 OPEN: tuple[JobState, ...] = ("waiting", "awarded", "finishing")
 FRAME_S, LINE_S, SNAPSHOT_S = 0.25, 5.0, 1.0
 """Real seconds between two frames on a terminal, between two tables without one, and of listening for one snapshot."""
@@ -77,8 +80,12 @@ def watch(
             end = ShiftEnd()
 
             def frames() -> Iterator[FleetSnapshot]:
+                lost = False
                 while not stop.is_set():
                     fleet = listener.view.snapshot(time.monotonic(), jobs=0)
+                    if lost != (fleet.lost_s is not None):
+                        lost = not lost
+                        news.append(f"the connection to the router is {'lost' if lost else 'restored'}")
                     if end.check(fleet, time.monotonic()):
                         return
                     listener.serve(time.monotonic() + FRAME_S)
@@ -117,21 +124,26 @@ def wait_for_fleet(endpoint: str, stop: StopRequest) -> str:
 class ShiftEnd:
     """Whether the shift has ended: all participants have left, and every job is settled.
 
+    Without a connection it is unknown who is present: only participants that left before have left.
+
     Attributes:
         sentence: How it ended; "" before.
     """
 
     def __init__(self) -> None:
         self.sentence = ""
-        self._seen, self._gone_s = False, math.inf
+        self._seen, self._gone_s, self._back_s = False, math.inf, -math.inf
 
     def check(self, fleet: FleetSnapshot, real_s: float) -> str:
         """Return how the shift ended; "" if it goes on."""
         present = any(each.token for each in (*fleet.arms, *fleet.auctioneers))
-        self._seen |= present
-        self._gone_s = math.inf if present or not self._seen else min(self._gone_s, real_s)
+        if fleet.lost_s is None:
+            self._seen |= present
+            self._gone_s = math.inf if present or not self._seen else min(self._gone_s, real_s)
+        elif real_s - fleet.lost_s < self._gone_s + LEFT_S:
+            self._gone_s, self._back_s = math.inf, real_s + RESTORED_S
         total, open_jobs = sum(fleet.counts.values()), sum(fleet.counts.get(state, 0) for state in OPEN)
-        if real_s >= self._gone_s + GONE_S and total and not open_jobs:
+        if real_s >= max(self._gone_s + GONE_S, self._back_s) and total and not open_jobs:
             counts = {state.replace("_", " "): fleet.counts.get(state, 0) for state in SETTLED[1:]}
             rest = [f"{count} {state}" for state, count in counts.items() if count]
             finished = f"{fleet.counts.get('finished', 0)} of {total} jobs finished"
@@ -313,7 +325,9 @@ def space_line(fleet: FleetSnapshot) -> Text:
     parts: list[str] = []
     for name, spaces in fleet.space.items():
         arm = arms.get(name)
-        where = "not present" if arm is None or not arm.present else "away from home" if arm.away else "has a job"
+        where = "not present"
+        if arm is not None and arm.present:
+            where = "away from home" if arm.away else "has a job" if arm.job else "has no job"
         parts.append(f"{name} ({where}{', may be anywhere' if ANYWHERE in spaces else ''})")
     return _line(f"space closed by: {', '.join(parts) or _none(fleet)}")
 

@@ -11,13 +11,14 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.router import Router, open_client
 from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import issue, make
 from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, wait_until
 
 ARMS = ("arm_0", "arm_1")
 SHORT_S = 0.3
@@ -132,6 +133,19 @@ def test_a_line_ends_with_its_certificate(folder, guarded, tmp_path):
             assert datetime.now(UTC) >= soon - timedelta(seconds=1)
             token.undeclare()
         watch.undeclare()
+
+
+def test_a_client_reports_that_its_certificate_has_expired(folder, guarded, tmp_path, caplog):
+    place = rogue_folder(tmp_path / "k", folder, "good")
+    soon = datetime.now(UTC) + timedelta(seconds=2.0)
+    issue(place, RosterEntry("arm_0", "arm"), days=1, now=soon - timedelta(days=1))
+    with BusClient(Tls(place, "arm_0").endpoint(guarded.endpoint), "f") as arm:
+        assert (arm.connected, arm.expiry) == (True, "")
+        wait_until(lambda: arm.expiry)
+        arm.serve()
+        arm.serve()
+        assert arm.expiry.startswith(f"The certificate of 'arm_0' expired on {soon:%Y-%m-%d %H:%M} UTC")
+    assert [each.levelname for each in caplog.records if each.getMessage() == arm.expiry] == ["ERROR"]
 
 
 def test_a_key_that_others_may_read_is_not_used(folder, tmp_path, guarded):

@@ -47,6 +47,11 @@ def test_an_absent_arm_that_keeps_its_space_is_a_warning():
     assert space_line(now).plain == "space closed by: a (away from home), b (not present, may be anywhere)"
 
 
+def test_an_idle_arm_that_quotes_space_is_not_said_to_have_a_job():
+    now = msgspec.structs.replace(fleet(arm(), arm(arm="b", job="j")), space={"a": ("s",), "b": ("t",)})
+    assert space_line(now).plain == "space closed by: a (has no job), b (has a job)"
+
+
 def faults(now, *probes, **more):
     found = check_health(now, 101.505, probes or [ASKED], **more)
     return [finding.what for finding in found.findings if finding.level == "fault"], found
@@ -120,8 +125,14 @@ def test_a_healthy_fleet_has_no_findings():
             "b shows its token but publishes no state",
         ),
         (fleet(arm(), arm(arm="b", present=False, token=False)), "b publishes its state but shows no token"),
-        (fleet(arm(), arm(arm="b", time_s=5060.0 + 60.0 * 3)), "3.0 s ahead"),
-        (fleet(arm(), arm(arm="b", time_s=5060.0 - 60.0 * 3)), "3.0 s behind"),
+        (
+            fleet(arm(), arm(arm="b", time_s=5060.0 + 60.0 * 3)),
+            "b is 3.0 real seconds ahead of fleet time: it does not set its clock",
+        ),
+        (
+            fleet(arm(), arm(arm="b", time_s=5060.0 - 60.0 * 3)),
+            "b is 3.0 real seconds behind fleet time: its machine may be overloaded",
+        ),
     ],
 )
 def test_each_fault_of_an_arm_is_one_finding(now, says):
@@ -164,6 +175,27 @@ def test_malformed_messages_are_a_fault_with_each_reason_once():
     assert output == ["3 malformed message(s), the last: no JSON.; no State."]
 
 
+@pytest.mark.parametrize(
+    ("age_s", "says"),
+    [
+        (None, "b shows its token but publishes no valid state: its states are malformed."),
+        (9.0, "b is stale, with a last state 9.0 s old: its states are malformed."),
+    ],
+)
+def test_an_arm_whose_states_are_malformed_is_not_said_to_hang(age_s, says):
+    now = fleet(arm(), arm(arm="b", present=False, state_age_s=age_s, time_s=None))
+    complaint = f"under '{keys.of_arm(now.fleet, 'b', 'state')}': Not a thermofleet.State.v4: no JSON."
+    output, _ = faults(now, malformed=1, complaints=[complaint])
+    assert says in output
+
+
+def test_an_arm_that_answers_no_awards_is_named():
+    left_out = {"b": "has not answered the last 3 awards"}
+    _, found = faults(msgspec.structs.replace(fleet(arm(), arm(arm="b")), left_out=left_out))
+    (finding,) = found.findings
+    assert finding.what.startswith("b has not answered the last 3 awards: it is awarded no job for a while.")
+
+
 def test_an_arm_that_left_earlier_is_missing_only_if_expected():
     assert faults(fleet(arm()))[0] == []
     assert faults(fleet(arm()), expected=("a", "b", "c"))[0] == ["Not present: b, c."]
@@ -179,7 +211,7 @@ def test_arms_that_are_all_off_the_same_way_are_one_warning(ahead_s):
     assert output == []
     way = "ahead of" if ahead_s[0] > 0 else "behind"
     assert [each.what.partition(" fleet time")[0] for each in found.findings] == [
-        f"Every arm is {min(map(abs, ahead_s)):.1f} s or more {way}"
+        f"Every arm is {min(map(abs, ahead_s)):.1f} real seconds or more {way}"
     ]
     output, _ = faults(fleet(*arms, arm(arm="b", time_s=5060.0)))
     assert len(output) == len(ahead_s)
@@ -273,7 +305,12 @@ def test_an_unhealthy_fleet_gives_exit_code_1_and_all_reasons():
         with BusClient(router.endpoint, "f") as other, serving(other, meanwhile=rubbish):
             code, output = doctor(router.endpoint)
     assert code == 1
-    for says in ("a shows its token but publishes no state", "2 auctioneers", "No arm is present", "malformed message"):
+    for says in (
+        "a shows its token but publishes no valid state",
+        "2 auctioneers",
+        "No arm is present",
+        "malformed message",
+    ):
         assert says in output
 
 

@@ -67,8 +67,30 @@ def bidding(*quotes: Quote, **more: Any) -> Bidding:
         ),
         (bidding(quote("a", plans=(), reason="too far")), "No arm can do it: a: too far."),
         (
-            bidding(quote("a", plans=(), reason="too far"), unasked={"c": "is not present", "b": "is paused by 'ann'"}),
+            bidding(quote("a", plans=(), reason="too far"), unasked={"b": "is paused by 'ann'"}, absent=frozenset("c")),
             "No arm that was asked can do it, and b is paused by 'ann', c is not present.",
+        ),
+        (
+            bidding(quote("a", plans=(), reason="too far"), absent=frozenset("bcdef"), unasked={"z": "is paused"}),
+            "No arm that was asked can do it, and z is paused, b, c, d and 2 others are not present.",
+        ),
+        (
+            bidding(
+                quote("a", plans=()), quote("b", plans=(), reason="too far"),
+                excluded={"j": {"a": "has refused it: no gripper"}},
+            ),
+            "No other arm that was asked can do it, and a has refused it: no gripper.",
+        ),
+        (
+            bidding(
+                quote("a", plans=()), quote("b", capacity=0), quote("c", capacity=0), quote("d", capacity=0),
+                quote("e", capacity=0, headroom_k=-1.0),
+                excluded={"j": {"a": "has refused it: no gripper"}}, at_work=frozenset("b"),
+                unfit={"c": "is paused by 'ann'", "e": "has impossible temperatures"},
+                states={each: state(each, space="s" * (each == "d")) for each in "bcd"},
+            ),
+            "b has a job, c is paused by 'ann', d is on its way home, e has impossible temperatures, "
+            "a has refused it: no gripper.",
         ),
         (
             bidding(quote("a", plans=(), reason=NOT_PLANNED), quote("b", plans=(), reason="too far")),

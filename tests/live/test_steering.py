@@ -130,6 +130,15 @@ def test_an_unfinished_job_is_redone_only_after_its_arm_was_stopped_and_cleared(
     assert not fleet.control(Settle("a", "redo"), "redo").changed
 
 
+def test_an_arm_that_is_paused_is_not_said_to_have_a_job(fleet):
+    fleet.control(Pause("arm_1"))
+    fleet.submit(job("a", **LONG), job("b", **LONG))
+    fleet.until(lambda: bool(fleet.holder("a")) and bool(fleet.holder("b")))
+    fleet.submit(job("c"))
+    fleet.until(lambda: "arm_1 is paused by 'ann'" in fleet.status("c").reason)
+    assert "arm_0 has a job" in fleet.status("c").reason
+
+
 def test_a_paused_arm_gives_its_job_back_and_gets_none_until_it_is_resumed(fleet):
     fleet.submit(job("a", 1000))
     fleet.until(lambda: fleet.status("a").cycles > 3)

@@ -48,6 +48,7 @@ from fleet.bus.security.certificates import issue, make
 from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
 from scenarios.cli.main import app
+from scenarios.live import requests
 from tests import commands
 from tests.waiting import PATIENCE_S, serving
 
@@ -180,15 +181,28 @@ def test_an_error_of_tls_is_one_sentence(fleet):
         raise done.exception
 
 
-def test_the_doctor_mentions_a_certificate_unknown_to_the_router(fleet, tmp_path):
-    place = tmp_path / "k"
+def issue_later(fleet, place, entry):
+    """Endpoint with a certificate that was issued after the router has read its roster."""
     make(place, of_arms("f", [ARM]), days=30)
     for name in ("ca.pem", "ca.key"):
         (place / name).write_bytes((fleet.keys / name).read_bytes())
-    issue(place, RosterEntry("spy", "monitor"), days=20)
-    done = run("doctor", f"{fleet.address}#{place}/spy")
+    issue(place, entry, days=20)
+    return f"{fleet.address}#{place}/{entry.name}"
+
+
+def test_the_doctor_mentions_a_certificate_unknown_to_the_router(fleet, tmp_path):
+    done = run("doctor", issue_later(fleet, tmp_path / "k", RosterEntry("spy", "monitor")))
     assert done.exit_code == 1
     assert "the router does not know this certificate" in " ".join(done.stdout.split())
+
+
+@pytest.mark.parametrize("command", [("arm", "pause"), ("arm", "clear", ARM), ("arm", "reset", ARM)], ids=" ".join)
+def test_a_request_without_a_reply_mentions_the_roster(fleet, tmp_path, monkeypatch, command):
+    monkeypatch.setattr(requests, "REPLY_S", 0.5)
+    endpoint = issue_later(fleet, tmp_path / "k", RosterEntry("ann", "operator"))
+    done = CliRunner().invoke(app, [*command, "--by", "ann", "--endpoint", endpoint, "--fleet", "f"])
+    assert isinstance(done.exception, BusError)
+    assert "it reads its roster when it starts" in str(done.exception)
 
 
 STEERING = {

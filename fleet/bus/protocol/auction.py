@@ -18,7 +18,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from fleet.bus.protocol.messages import Count, FiniteStruct, Name, Number, Person, Share
+from fleet.bus.protocol.messages import MOST, Count, Duration, FiniteStruct, Name, Number, Person, Share
 from fleet.errors import check_names
 from fleet.fields import MAX_SPEED, MIN_SPEED
 from fleet.job import (
@@ -35,6 +35,7 @@ from fleet.job import (
 from fleet.telemetry import Mode
 
 LeaseTime = Annotated[float, msgspec.Meta(gt=0, le=3600)]
+PlanTime = Annotated[float, msgspec.Meta(gt=0, le=MOST)]
 LEASE_S = 6.0
 """Real seconds that an arm may work on a job without renewing its lease."""
 NOT_PLANNED = "not planned yet; ask again"
@@ -155,9 +156,9 @@ class PlanQuote(FiniteStruct, frozen=True, omit_defaults=True):
     """d_k, [joint]."""
     difficulty: Number | None = None
     """d = Σ_k w_k d_k, with the weights of the arm's twin (`fleet.difficulty`)."""
-    duration_s: Number | None = None
+    duration_s: PlanTime | None = None
     """Duration of the job alone, from home to home."""
-    finish_in_s: Number | None = None
+    finish_in_s: Duration | None = None
     """Time until its last cycle would be done, after the arm's current jobs; without the way home."""
     space: Name | None = None
     """Name of the space of its plan, from home to home; null for unknown: its whole workspace counts as taken."""
@@ -373,6 +374,8 @@ class Status(msgspec.Struct, frozen=True):
     """Who paused an arm, by arm; "*" for all arms."""
     trouble: str = ""
     """Why its sender accepts and awards no jobs, for example a full disk; "" if it does."""
+    left_out: dict[Name, str] = {}
+    """Why an arm is awarded no job for a while, by arm: it has not answered the last awards."""
 
 
 class Announcement(msgspec.Struct, frozen=True):

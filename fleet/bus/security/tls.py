@@ -118,6 +118,21 @@ def participant_at(endpoint: str) -> RosterEntry | None:
     return RosterEntry(unquote(name), cast(Role, role)) if role in ROLES else None
 
 
+def expires_at(endpoint: str) -> datetime | None:
+    """When the certificate of an endpoint expires; None without TLS.
+
+    Raises:
+        BusError: the certificate is missing or damaged.
+    """
+    _, tls = identified(endpoint)
+    if tls is None:
+        return None
+    # Imported late: plain TCP does not need the library.
+    from fleet.bus.security.certificates import read
+
+    return read(tls.folder, tls.file).not_valid_after_utc
+
+
 _NO_REPLY = "the server does not use TLS: no reply to the handshake"
 
 

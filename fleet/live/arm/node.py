@@ -58,6 +58,7 @@ from fleet.live.arm.awards import ActiveAward, ArmHistory, AwardExecutor, FaultC
 from fleet.live.arm.body import Body
 from fleet.live.arm.estimator import NO_CYCLES, Estimator, ScoredPlan
 from fleet.live.clock import FleetClock, next_due_s
+from fleet.live.rate_limit import RateLimitedWarnings
 from fleet.live.space import ANYWHERE
 from fleet.offered_plans import PLANS
 
@@ -296,8 +297,6 @@ class ClockSync:
 _LOG = logging.getLogger(__name__)
 
 Message = TypeVar("Message", bound=msgspec.Struct)
-WARNING_S = 10.0
-"""Real seconds between two warnings about the same thing."""
 
 
 class WorkSource(Protocol):
@@ -323,20 +322,6 @@ class WorkSource(Protocol):
     def prepare_quote(self, real_s: float) -> None:
         """Prepare for an award, as the arm is about to quote."""
         ...
-
-
-class RateLimitedWarnings:
-    """Logs warnings of an arm, each kind at most once in `WARNING_S`."""
-
-    def __init__(self, arm: str) -> None:
-        self._arm = arm
-        self._logged_s: dict[str, float] = {}
-
-    def __call__(self, kind: str, sentence: str) -> None:
-        """Log a warning; `sentence` continues after the name of the arm."""
-        if (now_s := time.monotonic()) >= self._logged_s.get(kind, -math.inf) + WARNING_S:
-            self._logged_s[kind] = now_s
-            _LOG.warning("Arm '%s' %s", self._arm, sentence)
 
 
 class WorkingArm(Protocol):

@@ -34,7 +34,7 @@ from fleet.live.book import JobBook
 from fleet.live.epochs import adopted
 from fleet.live.job_rules import finish_s, joined_reasons
 from fleet.live.journal import JobsAccepted, Released
-from fleet.live.leases import Timing, clear, expire, progress, renewal, send_again, unanswered
+from fleet.live.leases import Timing, clear, expire, progress, renewal, send_again, unanswered, was_stopped
 from fleet.live.records import MAX_REASON, JobSettled, ShiftEnded, outcome_of, requested_job
 from fleet.live.space import Excludes, no_conflicts
 from fleet.live.steering import carry_out, controlled
@@ -102,6 +102,8 @@ class Auctioneer:
         self._take_space(request.arm, space_of(self.book, revoked, request.arm))
         for award, entry in its.items():
             lease = self.book.leases[award]
+            if lease.unanswered is not None:
+                self.rounds.back_offs.end(request.arm, entry.job)
             lease.unanswered, lease.cycles = None, max(entry.cycles, lease.cycles)
             if award not in leased:  # its arm ends the cycle in progress, which may take longer than a lease
                 lease.until_s = real_s + self._timing.counted_lease_s
@@ -134,6 +136,15 @@ class Auctioneer:
         if grant.outcome not in ("finished", "unfinished", "returned"):
             if report.outcome == "finished" and not grant.may_commit:
                 _LOG.error("'%s' finished '%s' without permission to commit.", arm, job)
+            spec = self.book.jobs[job].spec
+            if report.outcome == "finished" and spec is not None and report.cycles != spec.repetitions:
+                _LOG.warning(
+                    "'%s' reports '%s' finished after %d cycles, but it has %d: it counts as finished.",
+                    arm,
+                    job,
+                    report.cycles,
+                    spec.repetitions,
+                )
             # The space of an award that has ended may have been freed since.
             space = retaken_space(self.book, arm, {grant.record.space}) if grant.outcome else []
             shown = replace(report, time_s=min(report.time_s, time_s), reason=report.reason[:MAX_REASON])
@@ -160,6 +171,11 @@ class Auctioneer:
         if (current := self.rounds.open) is not None and quote.auction == current.auction:
             current.quotes[quote.arm] = quote
 
+    def note_unusable_quote(self, auction: str, arm: str, why: str) -> None:
+        """Note what is wrong with the reply of an arm in a round, for the reasons of its jobs."""
+        if (current := self.rounds.open) is not None and auction == current.auction:
+            current.unusable[arm] = why[:MAX_REASON]
+
     def end_quotes(self, auction: str) -> None:
         """Have the next tick close a round: no more quotes will arrive."""
         if (current := self.rounds.open) is not None and current.auction == auction:
@@ -170,11 +186,13 @@ class Auctioneer:
         lease = self.book.leases.get(ack.award)
         if lease is None or lease.unanswered is None or lease.unanswered.arm != ack.arm:
             return
-        if not ack.accepted:
+        job = lease.unanswered.award.job.name
+        if ack.accepted:
+            self.rounds.back_offs.end(ack.arm, job)
+        else:
             reason = f"'{ack.arm}' refused it: {ack.reason}"[:MAX_REASON]
-            job = lease.unanswered.award.job.name
             self.book.record(Released(ack.award, job, ack.arm, "refused", 0, time_s, reason))
-            self.rounds.delay(real_s, (job,))
+            self.rounds.back_offs.add_refusal(ack.arm, job, ack.reason[:MAX_REASON], real_s)
         lease.unanswered = None
         if not unanswered(self.book.leases):
             self.rounds.scan_now()
@@ -210,7 +228,11 @@ class Auctioneer:
 
     def tick(self, real_s: float, time_s: float) -> None:
         """Do what is due."""
-        if expire(self.book, real_s, time_s):
+        ended = expire(self.book, real_s, time_s)
+        for lease in ended:
+            if lease.unanswered is not None and not was_stopped(lease, real_s):
+                self.rounds.back_offs.add_unanswered(lease.unanswered.arm, lease.unanswered.award.job.name, real_s)
+        if ended:
             self.rounds.retry_now()
         if real_s >= self._checked_s + SCAN_S:
             self._checked_s = real_s

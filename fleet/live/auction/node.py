@@ -4,7 +4,8 @@ import logging
 import math
 import secrets
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from functools import partial
 
 from fleet.bus.client import BusClient, Replies
@@ -40,6 +41,7 @@ from fleet.live.epochs import REMEDY, REPLY_S, ask_arms, check_begin, describe, 
 from fleet.live.journal import EpochBegun, Journal, Started, TimeRecorder, own_records
 from fleet.live.leases import Timing
 from fleet.live.monitor.snapshot import FRESH_S
+from fleet.live.rate_limit import RateLimitedWarnings
 from fleet.live.records import BookRecord, SendAward
 from fleet.live.space import Excludes, no_conflicts
 
@@ -193,6 +195,8 @@ class AuctionNode(JobDesk):
         self._tokens: set[str] = set()
         self._state_s: dict[str, float] = {}
         """Real second of the last state of each arm."""
+        self._warnings: dict[str, RateLimitedWarnings] = {}
+        """By arm with a token."""
         self._declare()
 
     @property
@@ -297,6 +301,9 @@ class AuctionNode(JobDesk):
             return f"No jobs are accepted or awarded: {self._recorder.failure}"
         return self._epochs.objection
 
+    def _left_out(self) -> Mapping[str, str]:
+        return self.auctioneer.rounds.back_offs.unanswering
+
     def _submit(self, submission: Submission) -> SubmissionReply:
         self._check_alone("no jobs are accepted")
         if self._epochs.objection:
@@ -324,7 +331,9 @@ class AuctionNode(JobDesk):
         (self._tokens.add if present else self._tokens.discard)(arm)
         if not present:
             self._state_s.pop(arm, None)
+            self._warnings.pop(arm, None)
             self._epochs.forget(arm)
+            self.auctioneer.rounds.back_offs.forget(arm)
 
     # Other auctioneers
 
@@ -398,7 +407,7 @@ class AuctionNode(JobDesk):
             match out.popleft():
                 case QuoteRequest() as request:
                     key, done = keys.of_every_arm(fleet, "quote"), partial(self._end_quotes, request.auction)
-                    window_s, add = self._timing.window_s, self.auctioneer.add_quote
+                    window_s, add = self._timing.window_s, partial(self._add_quote, request)
                     self._link.query(key, request, Quote, done, timeout_s=window_s, each=add)
                 case SendAward(arm, award):
                     key = keys.of_arm(fleet, arm, "award")
@@ -411,9 +420,30 @@ class AuctionNode(JobDesk):
                     self._operation(operation)
 
     def _end_quotes(self, auction: str, replies: Replies[Quote]) -> None:
-        for reason in filter(None, replies.refused.values()):
-            _LOG.warning("No quote: %s", reason)
+        for key, reason in replies.refused.items():
+            if reason and (arm := _arm_of(key)):
+                self._note_unusable_quote(auction, arm, "invalid", f"gave no valid quote: {reason.rstrip('.')}")
+            elif reason:
+                _LOG.warning("No quote: %s", reason)
         self.auctioneer.end_quotes(auction)
+
+    def _add_quote(self, request: QuoteRequest, quote: Quote) -> None:
+        if quote.auction != request.auction:
+            self._note_unusable_quote(request.auction, quote.arm, "round", "quoted for another round")
+            return
+        missing = {job.name for job in request.jobs} - {each.job for each in quote.estimates}
+        if missing:
+            self._warn(quote.arm, "jobs", f"did not quote '{min(missing)}', as requested.")
+        self.auctioneer.add_quote(quote)
+
+    def _note_unusable_quote(self, auction: str, arm: str, kind: str, why: str) -> None:
+        self._warn(arm, kind, f"{why}.")
+        self.auctioneer.note_unusable_quote(auction, arm, why)
+
+    def _warn(self, arm: str, kind: str, sentence: str) -> None:
+        """Log a warning about an arm with a token; any process may reply in the name of others."""
+        if arm in self._tokens:
+            self._warnings.setdefault(arm, RateLimitedWarnings(arm))(kind, sentence)
 
     def _apply_acks(self, replies: Replies[Ack]) -> None:
         for ack in replies.messages.values():
@@ -423,3 +453,10 @@ class AuctionNode(JobDesk):
                 _LOG.error("Could not record the answer of '%s': %s", ack.arm, error)
         for reason in filter(None, replies.refused.values()):
             _LOG.warning("No answer to an award: %s", reason)
+
+
+def _arm_of(key: str) -> str:
+    """Return the arm in the key of a reply; "" if the replier is unknown."""
+    with suppress(ValueError):
+        return keys.parse(key).name
+    return ""

@@ -44,6 +44,12 @@ _LOG = logging.getLogger(__name__)
 
 MAX_REASON = 500
 """Characters of a reason, so that a message does not grow with the number of arms."""
+MOST_ABSENT = 3
+"""Absent arms that a reason names."""
+MOST_UNANSWERED = 3
+"""Number of awards in a row that an arm has not answered, after which it is awarded no job for a while."""
+MAX_BACK_OFFS = 4096
+"""Arms and jobs of which the last refusals are kept; the oldest are dropped."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +76,13 @@ class Bidding:
     absent: frozenset[str] = frozenset()
     """Arms that may take space and are not present."""
     unasked: Mapping[str, str] = field(default_factory=dict[str, str])
-    """Why other known arms have not quoted, by arm."""
+    """Why other present arms have not quoted, by arm."""
+    excluded: Mapping[str, Mapping[str, str]] = field(default_factory=dict[str, Mapping[str, str]])
+    """Why arms are not awarded a job for a while, by arm, by job; their quotes have no plan for it."""
+    unfit: Mapping[str, str] = field(default_factory=dict[str, str])
+    """Why arms accept no job now, by arm, as far as quotes and states do not show it."""
+    at_work: frozenset[str] = frozenset()
+    """Arms that have a job."""
 
     def offer(self, arm: str, job: str, plan: int = 0) -> PlanQuote | None:
         """Return what an arm quotes for a plan of a job of the round; None if it is not open."""
@@ -129,6 +141,7 @@ class Bidding:
             quotes={arm: quote for arm, quote in self.quotes.items() if arm not in winners},
             full={**self.full, **{arm: self.quotes[arm] for arm in winners}},
             busy=self.busy.union(*(job.stations for job in self.jobs if job.name in allocation)),
+            at_work=self.at_work | winners.keys(),
             taken={**self.taken, **spaces},
         )
 
@@ -232,27 +245,53 @@ def reason_to_wait(bidding: Bidding, job: str) -> str:
     """Return why no arm begins a job, by the quotes of a round that has just closed."""
     if any(each.name == job and not bidding.has_free_stations(each) for each in bidding.jobs):
         return "Its place was in use when it was last offered."
-    if not (estimates := bidding.estimates(job)):
-        return "No arm has answered whether it can do it."
+    estimates, excluded = bidding.estimates(job), bidding.excluded.get(job, {})
     able = {arm: each.plans for arm, each in estimates.items() if each.feasible}
     if offered := {arm: plans for arm in able if (plans := bidding.plans(arm, job))}:
         late = _lateness(bidding, job, (plan for plans in offered.values() for plan in plans.values()))
         return f"The policy lets it wait: {late}{', '.join(offered)} could begin it."[:MAX_REASON]
-    refusals = {arm: each.reason or "infeasible" for arm, each in estimates.items() if not each.feasible}
+    refusals = {
+        arm: each.reason or "infeasible" for arm, each in estimates.items() if not each.feasible and arm not in excluded
+    }
     if NOT_PLANNED in refusals.values():
         return "Arms are planning its motion."
-    if not able and bidding.unasked:
-        others = ", ".join(f"{arm} {why}" for arm, why in sorted(bidding.unasked.items()))
-        return f"No arm that was asked can do it, and {others}."[:MAX_REASON]
+    quoted = bidding.quotes.keys() | bidding.full.keys()
+    unquoted = dict.fromkeys(quoted - estimates.keys(), "did not quote this job")
+    out = {arm: why for arm, why in excluded.items() if arm in quoted}
+    others = [f"{arm} {why}" for arm, why in sorted({**unquoted, **out, **bidding.unasked}.items())]
     if not able:
-        return no_arm_can(refusals)
+        if bidding.absent:
+            others.append(_not_present(bidding.absent))
+        return _no_arm(refusals, others, "other arm" if out else "arm")
     plans = [(arm, plan) for arm in able.keys() & bidding.quotes for plan in able[arm]]
     in_way = {other for arm, plan in plans for other in bidding.in_the_way(arm, plan.space)}
     reasons = [f"It waits until {', '.join(sorted(in_way))} is out of the way."] if in_way else []
-    reasons += [f"{arm} is not present." for arm in sorted(in_way & bidding.absent)]
+    reasons += [f"{_not_present(in_way & bidding.absent)}."] if in_way & bidding.absent else []
     taken = [f"{arm} {_why_without_capacity(bidding, arm)}" for arm in able if arm in bidding.full]
-    reasons += [f"{', '.join(taken)}."] if taken else []
+    reasons += [f"{', '.join([*taken, *others])}."] if taken or others else []
     return " ".join(reasons)[:MAX_REASON]
+
+
+def _no_arm(refusals: Mapping[str, str], others: Sequence[str], asked: str) -> str:
+    """Return why no arm with a quote can do a job.
+
+    Args:
+        refusals: Reasons of the arms that cannot.
+        others: What is known of each other arm.
+        asked: Name of the arms that cannot.
+    """
+    if not others:
+        return no_arm_can(refusals) if refusals else "No arm has answered whether it can do it."
+    start = f"No {asked} that was asked can do it, and " if refusals else ""
+    return f"{start}{', '.join(others)}."[:MAX_REASON]
+
+
+def _not_present(arms: Iterable[str]) -> str:
+    """Return that some arms are not present; of many only the first are named."""
+    names = sorted(arms)
+    shown, more = names[:MOST_ABSENT], len(names[MOST_ABSENT:])
+    others = f" and {more} other{'s' if more > 1 else ''}" if more else ""
+    return f"{', '.join(shown)}{others} {'are' if len(names) > 1 else 'is'} not present"
 
 
 def _lateness(bidding: Bidding, job: str, plans: Iterable[PlanQuote]) -> str:
@@ -265,11 +304,17 @@ def _lateness(bidding: Bidding, job: str, plans: Iterable[PlanQuote]) -> str:
 
 def _why_without_capacity(bidding: Bidding, arm: str) -> str:
     quote, state = bidding.full[arm], bidding.states.get(arm)
+    if arm in bidding.unfit:
+        return bidding.unfit[arm]
     if quote.mode == "faulted":
         return "is faulted"
     if state is not None and state.break_in_s == 0.0:
         return "has a break"
-    return "is above its warning limit" if quote.headroom_k <= 0.0 else "has a job"
+    if quote.headroom_k <= 0.0:
+        return "is above its warning limit"
+    if state is None or state.job or arm in bidding.at_work:
+        return "has a job"
+    return "is on its way home" if state.space else "accepts no job now"
 
 
 def planned_jobs(quotes: Mapping[str, Quote]) -> set[str]:
@@ -277,6 +322,86 @@ def planned_jobs(quotes: Mapping[str, Quote]) -> set[str]:
     offers = [offer for quote in quotes.values() for offer in quote.estimates]
     open_jobs = {offer.job for offer in offers if offer.reason == NOT_PLANNED}
     return {offer.job for offer in offers if offer.feasible or offer.job not in open_jobs}
+
+
+class BackOff(NamedTuple):
+    """Why, how often in a row, and until which real second an arm was not awarded a job."""
+
+    why: str
+    times: int
+    until_s: float
+
+
+ANY_JOB = ""
+"""In place of the name of a job: all of them."""
+
+
+class BackOffs:
+    """Arms that are not awarded a job for a while: they refused it, or did not answer its award.
+
+    The pause doubles each time in a row. An arm that has not answered several awards in a row is awarded no job.
+    """
+
+    def __init__(self, first_s: float, longest_s: float) -> None:
+        """Start without any; arguments in real seconds, the first pause and the longest."""
+        self._first_s, self._longest_s = first_s, longest_s
+        self._last: dict[tuple[str, str], BackOff] = {}
+        """By arm and job; of the awards that an arm has not answered in a row, by `ANY_JOB`."""
+
+    def add_refusal(self, arm: str, job: str, why: str, real_s: float) -> None:
+        """Count the refusal of an award."""
+        self._last.pop((arm, ANY_JOB), None)
+        self._add(arm, job, f"has refused it: {why.rstrip('.') or 'no reason'}", real_s)
+
+    def add_unanswered(self, arm: str, job: str, real_s: float) -> None:
+        """Count an award that has ended without an answer."""
+        self._add(arm, job, "did not answer its award", real_s)
+        self._add(arm, ANY_JOB, "", real_s)
+
+    def end(self, arm: str, job: str) -> None:
+        """End the back-offs of an arm that has accepted a job."""
+        self._last.pop((arm, job), None)
+        self._last.pop((arm, ANY_JOB), None)
+
+    def forget(self, arm: str) -> None:
+        """Forget all of an arm: it may come back with another program."""
+        self._last = {key: each for key, each in self._last.items() if key[0] != arm}
+
+    def why_by_job(self, real_s: float) -> dict[str, dict[str, str]]:
+        """Return why arms are not awarded a job now, by arm, by job."""
+        by_job: dict[str, dict[str, str]] = {}
+        for (arm, job), each in self._last.items():
+            if job != ANY_JOB and real_s < each.until_s:
+                by_job.setdefault(job, {})[arm] = each.why
+        return by_job
+
+    def why_no_job(self, arm: str, real_s: float) -> str:
+        """Return why an arm is awarded no job now; "" if it may be."""
+        each = self._last.get((arm, ANY_JOB))
+        return self.unanswering.get(arm, "") if each is not None and real_s < each.until_s else ""
+
+    @property
+    def unanswering(self) -> dict[str, str]:
+        """Arms that have not answered several awards in a row, and that they have not."""
+        return {
+            arm: f"has not answered the last {each.times} awards"
+            for (arm, job), each in self._last.items()
+            if job == ANY_JOB and each.times >= MOST_UNANSWERED
+        }
+
+    def _add(self, arm: str, job: str, why: str, real_s: float) -> None:
+        last = self._last.pop((arm, job), None)
+        times = 1 if last is None else last.times + 1
+        pause_s = min(self._first_s * 2.0 ** min(times - 1, 30), self._longest_s)
+        self._last[arm, job] = BackOff(why, times, real_s + pause_s)
+        if len(self._last) > MAX_BACK_OFFS:
+            del self._last[next(iter(self._last))]
+
+
+def without_excluded(quote: Quote, excluded: Mapping[str, Mapping[str, str]]) -> Quote:
+    """Return a quote without the plans for jobs that its arm is not awarded for a while, as in `Bidding`."""
+    estimates = (JobEstimate(each.job) if quote.arm in excluded.get(each.job, ()) else each for each in quote.estimates)
+    return replace(quote, estimates=tuple(estimates)) if excluded else quote
 
 
 @dataclass(eq=False)
@@ -293,10 +418,12 @@ class Round:
     """Space that each arm might still take for closed awards alone when the round was opened: its quote says if it
     does."""
     quotes: dict[str, Quote] = field(default_factory=dict[str, Quote])
+    unusable: dict[str, str] = field(default_factory=dict[str, str])
+    """What is wrong with the replies of arms without a usable quote, by arm."""
 
     def complete(self, present: frozenset[str]) -> bool:
         """Return whether every arm that was asked and is still present has answered."""
-        return (self.asked & present) <= self.quotes.keys()
+        return (self.asked & present) <= self.quotes.keys() | self.unusable.keys()
 
 
 def new_awards(book: JobBook, bidding: Bidding, allocation: Mapping[str, Assignment], time_s: float) -> list[Granted]:
@@ -394,6 +521,7 @@ class Rounds:
         sensors: The motor sensors of each arm.
         present: Arms that are present.
         obstacle: Why no job is awarded; "" if jobs are.
+        back_offs: Arms that are not awarded jobs for a while.
     """
 
     def __init__(
@@ -412,6 +540,7 @@ class Rounds:
         self.sensors: defaultdict[str, ArmSensors] = defaultdict(ArmSensors)
         self.present: frozenset[str] = frozenset()
         self.obstacle = ""
+        self.back_offs = BackOffs(*timing.refused_s)
         self._name, self._book, self.allocate, self._send = name, book, allocate, send
         self._timing, self._excludes, self._boot = timing, excludes, boot
         self._count = 0
@@ -419,7 +548,7 @@ class Rounds:
         """Real second from which a job may be offered again."""
         self._notes: dict[str, str] = {}
         """Why no arm began a job that was offered, by job."""
-        self._time_s = -math.inf
+        self._real_s = self._time_s = -math.inf
         self._planned: set[str] = set()
         """Waiting jobs for which arms have plans, or have said that there is none."""
         self._scan_s = self._space_s = -math.inf
@@ -428,7 +557,7 @@ class Rounds:
 
     def step(self, real_s: float, time_s: float) -> None:
         """Open or close a round if that is due."""
-        self._time_s = time_s
+        self._real_s, self._time_s = real_s, time_s
         if self.open is None:
             if real_s >= self._scan_s:
                 self._scan_s = real_s + SCAN_S
@@ -453,8 +582,12 @@ class Rounds:
             return f"All arms are paused{by_whom(pauser)}."
         if not self.present:
             return "No arm is present."
-        if all(map(book.is_paused, self.present)):
+        able = [arm for arm in sorted(self.present) if not book.is_paused(arm)]
+        if not able:
             return "All present arms are paused."
+        left_out = {arm: self.back_offs.why_no_job(arm, self._real_s) for arm in able}
+        if all(left_out.values()):
+            return f"{', '.join(f'{arm} {why}' for arm, why in left_out.items())}."[:MAX_REASON]
         if reason := why_not_ready(job, self._time_s, book.is_finished, busy):
             return reason
         most, soon = self._timing.max_jobs, "It waits to be offered in the next round."
@@ -480,7 +613,7 @@ class Rounds:
     def _begin(self, real_s: float, time_s: float) -> None:
         waiting = unanswered(self._book.leases)
         book = self._book
-        able = {arm for arm in self.present if not book.is_paused(arm)}
+        able = {arm for arm in self.present if not (book.is_paused(arm) or self.back_offs.why_no_job(arm, real_s))}
         bidders = frozenset(able - {message.arm for _, message in waiting})
         if any(real_s < lease.sent_s + self._timing.window_s for lease, _ in waiting):
             return
@@ -541,22 +674,27 @@ class Rounds:
             for arm, quote in closing.quotes.items()
             if self._may_work(arm, closing)
         }
+        self._planned |= planned_jobs(quotes)
+        excluded = self.back_offs.why_by_job(real_s)
+        usable = {arm: without_excluded(quote, excluded) for arm, quote in quotes.items()}
         taken = self._book.taken_space()
         bidding = Bidding(
             closing.auction,
             time_s,
             jobs,
-            {arm: quote for arm, quote in quotes.items() if quote.capacity},
-            {arm: quote for arm, quote in quotes.items() if not quote.capacity},
+            {arm: quote for arm, quote in usable.items() if quote.capacity},
+            {arm: quote for arm, quote in usable.items() if not quote.capacity},
             states=self.states,
             returned={entry.name: (len(entry.faults), entry.returned_s) for entry in entries if entry.returns},
             busy=self._book.busy_stations(),
             taken=taken,
             excludes=self._excludes,
             absent=frozenset(taken.keys() - self.present),
-            unasked={arm: self._why_unasked(arm) for arm in (self.present | taken.keys()) - quotes.keys()},
+            unasked={arm: self._why_unasked(arm, closing, real_s) for arm in self.present - quotes.keys()},
+            excluded=excluded,
+            unfit={arm: why for arm in quotes if (why := self.sensors[arm].why_unfit)},
+            at_work=frozenset(arm for arm, _ in self._book.at_work().values()),
         )
-        self._planned |= planned_jobs(quotes)
         allocation = drop_invalid(bidding, self.allocate(bidding)) if bidding.quotes and jobs else {}
         try:
             self._award(bidding, allocation, real_s, time_s)
@@ -572,11 +710,17 @@ class Rounds:
                 self._scan_s = real_s + self._pause_s
             self.delay(real_s, (job.name for job in closing.jobs))
 
-    def _why_unasked(self, arm: str) -> str:
+    def _why_unasked(self, arm: str, closing: Round, real_s: float) -> str:
         paused = self._book.operations.paused
-        if arm not in self.present:
-            return "is not present"
-        return f"is paused{by_whom(paused[arm])}" if arm in paused else "has not answered in time"
+        if arm in paused:
+            return f"is paused{by_whom(paused[arm])}"
+        if why := self.back_offs.why_no_job(arm, real_s):
+            return why
+        if any(message.arm == arm for _, message in unanswered(self._book.leases)):
+            return "has not answered its last award yet"
+        if arm not in closing.asked:
+            return "was not asked in time"
+        return closing.unusable.get(arm, "has not answered in time")
 
     def _may_work(self, arm: str, closing: Round) -> bool:
         return arm in closing.asked & self.present and not self._book.is_paused(arm)

@@ -20,7 +20,7 @@ from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply, History, Histor
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
 from fleet.errors import BusError, JournalFull, Refused
-from fleet.live.arm.node import ArmNode, RateLimitedWarnings
+from fleet.live.arm.node import ArmNode
 from fleet.live.book import JobBook
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Granter
@@ -29,6 +29,7 @@ from fleet.live.desk import JobDesk
 from fleet.live.epochs import REPLY_S, adopted, ask_arms, check_journals, history_of
 from fleet.live.job_rules import SHIFT_ENDED
 from fleet.live.journal import EpochBegun, Journal, Started, TimeRecorder, own_records
+from fleet.live.rate_limit import RateLimitedWarnings
 from fleet.live.records import BookRecord
 
 _LOG = logging.getLogger(__name__)

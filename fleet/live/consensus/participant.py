@@ -384,8 +384,9 @@ class Participant:
     def _bidding(self, bids: dict[str, Bid], names: Iterable[str]) -> Bidding:
         """Return the bids for some jobs as in a round of an auctioneer."""
         quotes = {arm: self._sensors[arm].check_quote(_quote(bid, self.states.get(arm))) for arm, bid in bids.items()}
-        book = self.book
+        book, paused = self.book, self.book.operations.paused
         entries = [book.jobs[name] for name in dict.fromkeys(names) if name in book.jobs]
+        unfit = {arm: why for arm in bids if (why := self._sensors[arm].why_unfit)}
         return Bidding(
             auction="consensus",
             time_s=max(bid.time_s for bid in bids.values()),
@@ -397,6 +398,8 @@ class Participant:
             busy=book.busy_stations(),
             taken=book.taken_space(),
             excludes=self._excludes,
+            unfit=unfit | {arm: f"is paused{by_whom(paused[arm])}" for arm in bids if arm in paused},
+            at_work=frozenset(arm for arm, _ in book.at_work().values()),
         )
 
     def _pause(self, job: str, real_s: float) -> None:

@@ -1,7 +1,7 @@
 """Health of a fleet: findings from a snapshot, clock replies and malformed messages."""
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Container, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from shlex import quote
@@ -10,20 +10,24 @@ from typing import Literal, get_args
 
 import msgspec
 
+from fleet.bus.protocol import keys
 from fleet.live.clock import FleetClock
 from fleet.live.monitor.snapshot import FRESH_S, SILENT_S, ArmSnapshot, FleetSnapshot
 
 REASONS = {
-    "It is released at": "release", "It waits for": "predecessor", "are paused": "paused", "paused by": "paused",
-    "waits to be offered": "queue", "has a break": "break", "are planning": "planning",
-    "is above its warning limit": "hot", "is faulted": "faulted", "It waits until": "space",
-    "No arm can do it": "no_arm", "The policy lets it wait": "policy", "Its place was in use": "place",
-    "is in use": "place", "has a job": "busy",
+    "It is released at": "release", "It waits for": "predecessor", "are paused": "paused",
+    "waits to be offered": "queue", "has refused it": "refused", "has not answered": "unanswered",
+    "not answer its award": "unanswered", "no valid quote": "quote", "quoted for another round": "quote",
+    "did not quote": "quote", "paused by": "paused", "is paused": "paused", "has a break": "break",
+    "are planning": "planning", "is above its warning limit": "hot", "has impossible temperatures": "sensor",
+    "is faulted": "faulted", "It waits until": "space", "No arm can do it": "no_arm",
+    "The policy lets it wait": "policy", "Its place was in use": "place", "is in use": "place", "has a job": "busy",
+    "is on its way home": "busy",
 }  # fmt: skip
 """Class of the reason of a waiting job, by a part of it; the first part that it has counts."""
 OTHER = "other"
 """Class of any other reason."""
-EXPECTED = ("release", "predecessor", "paused", "queue", "break", "planning", "hot", "faulted")
+EXPECTED = ("release", "predecessor", "paused", "queue", "break", "planning", "hot", "sensor", "faulted")
 """Classes of jobs that wait in order."""
 MOST_REASONS = 5
 NO_OFFSETS: Mapping[str, float] = {}
@@ -125,10 +129,16 @@ def check_health(
     common_s = common_offset_s(offsets_s.values())
     findings = [
         *check_auctioneers(fleet, probes, auctioneer),
-        *check_fleet(fleet, earlier, {a: off_s for a, off_s in offsets_s.items() if abs(off_s - common_s) > OFFSET_S}),
+        *check_fleet(
+            fleet,
+            earlier,
+            {a: off_s for a, off_s in offsets_s.items() if abs(off_s - common_s) > OFFSET_S},
+            _with_malformed_states(fleet, complaints),
+        ),
     ]
     if abs(common_s) > OFFSET_S:
-        off = f"Every arm is {abs(common_s):.1f} s or more {'ahead of' if common_s > 0 else 'behind'} fleet time."
+        way = "ahead of" if common_s > 0 else "behind"
+        off = f"Every arm is {abs(common_s):.1f} real seconds or more {way} fleet time."
         why = "After a restart of the auctioneer that ends within 2 min; otherwise its machine may be overloaded."
         findings.append(Finding("warning", f"{off} {why}"))
     if missing := [name for name in expected if name not in {arm.arm for arm in fleet.arms if arm.token}]:
@@ -158,23 +168,45 @@ def check_health(
 
 
 def check_fleet(
-    fleet: FleetSnapshot, earlier: FleetSnapshot | None, offsets_s: Mapping[str, float] = NO_OFFSETS
+    fleet: FleetSnapshot,
+    earlier: FleetSnapshot | None,
+    offsets_s: Mapping[str, float] = NO_OFFSETS,
+    malformed: Container[str] = (),
 ) -> list[Finding]:
     """What snapshots show of arms, jobs and space: the findings that raise alarms, except that of a lost connection.
 
     Args:
         earlier: As in `check_health`.
         offsets_s: As in a report, of the arms whose offset is to be checked.
+        malformed: Arms whose last states were malformed, as far as it is known.
     """
-    arms = (finding for arm in fleet.arms for finding in check_arm(arm, offsets_s.get(arm.arm)))
-    return [*arms, *check_awards(fleet), *check_jobs(fleet), *check_progress(fleet, earlier), *check_space(fleet)]
+    arms = (
+        finding
+        for arm in fleet.arms
+        for finding in check_arm(arm, offsets_s.get(arm.arm), malformed=arm.arm in malformed)
+    )
+    left_out = (check_left_out(arm, why) for arm, why in sorted(fleet.left_out.items()))
+    return [
+        *arms,
+        *left_out,
+        *check_awards(fleet),
+        *check_jobs(fleet),
+        *check_progress(fleet, earlier),
+        *check_space(fleet),
+    ]
+
+
+def check_left_out(arm: str, why: str) -> Finding:
+    """Return the finding of an arm that is awarded no jobs for a while."""
+    return Finding("warning", f"{arm} {why}: it is awarded no job for a while. Its process may hang.")
 
 
 def check_connection(fleet: FleetSnapshot) -> list[Finding]:
     """Check that the listener has a connection to the router: without one a snapshot shows an earlier fleet."""
     if fleet.lost_s is None:
         return []
-    lost = "The connection to the router is lost: the router has ended, or is unreachable. What is shown is from before"
+    why = fleet.expiry.rstrip(".") or "The connection to the router is lost: the router has ended, or is unreachable"
+    lost = f"{why}. What is shown is from before"
     what = f"{lost}, {fleet.lost_s:.0f} s ago."
     return [Finding("fault", what, "connection", since_s=fleet.lost_s, lasting=f"{lost}.")]
 
@@ -286,20 +318,34 @@ def check_auctioneers(fleet: FleetSnapshot, probes: Sequence[ClockProbe], wanted
     return [Finding("fault", problem)]
 
 
-def check_arm(arm: ArmSnapshot, offset_s: float | None) -> list[Finding]:
-    """Check the token, state, mode and clock of one arm."""
+def _with_malformed_states(fleet: FleetSnapshot, complaints: Sequence[str]) -> set[str]:
+    """Arms about whose states there are complaints, which name the key."""
+    names = {arm.arm: f"'{keys.of_arm(fleet.fleet, arm.arm, 'state')}'" for arm in fleet.arms}
+    return {arm for arm, key in names.items() if any(key in complaint for complaint in complaints)}
+
+
+def check_arm(arm: ArmSnapshot, offset_s: float | None, *, malformed: bool = False) -> list[Finding]:
+    """Check the token, state, mode and clock of one arm.
+
+    Args:
+        malformed: Whether its last states were malformed.
+    """
     age_s = arm.state_age_s
     if not arm.token and age_s is None:
         return [Finding("warning", f"{arm.arm} has left: it has no token, but some of its messages are still cached.")]
-    problem = ""
+    problem, cause = "", "its states are malformed." if malformed else "its process may hang."
     if not arm.token:
         problem = "publishes its state but shows no token: it left, or another process uses its name."
     elif age_s is None:
-        problem = "shows its token but publishes no state: its process may hang."
+        problem = f"shows its token but publishes no {'valid ' if malformed else ''}state: {cause}"
     elif age_s > FRESH_S:
-        problem = f"is stale: its last state is {age_s:.1f} s old. Its process may hang."
+        problem = f"is stale, with a last state {age_s:.1f} s old: {cause}"
     absent = f"{arm.arm} is absent: it has left, or its process hangs or has ended."
     findings = [Finding("fault", f"{arm.arm} {problem}", "absent", arm.arm, lasting=absent)] if problem else []
+    if arm.doubled:
+        findings.append(
+            Finding("fault", f"Two processes publish as arm {arm.arm}: its ticks go back and forth. Stop one.")
+        )
     if arm.mode == "faulted":
         hot = f"{arm.arm} is faulted: joint {arm.joint} is at {arm.hottest_c:.1f} °C."
         findings.append(Finding("warning", hot, "fault", arm.arm))
@@ -311,8 +357,10 @@ def check_arm(arm: ArmSnapshot, offset_s: float | None) -> list[Finding]:
         wrong = f"{arm.arm} has impossible temperatures: {arm.bad_sensor}."
         findings.append(Finding("warning", wrong, "sensor", arm.arm))
     if offset_s is not None and abs(offset_s) > OFFSET_S:
-        offset = f"{abs(offset_s):.1f} s {'ahead of' if offset_s > 0 else 'behind'} fleet time"
-        findings.append(Finding("fault", f"{arm.arm} is {offset}: its machine may be overloaded, or its process hang."))
+        way = "ahead of fleet time: it does not set its clock by the replies to clock/now."
+        if offset_s < 0:
+            way = "behind fleet time: its machine may be overloaded, or its process hang."
+        findings.append(Finding("fault", f"{arm.arm} is {abs(offset_s):.1f} real seconds {way}"))
     return findings
 
 

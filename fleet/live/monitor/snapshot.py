@@ -8,7 +8,7 @@ fleet.
 import logging
 import math
 import time
-from collections import Counter, OrderedDict
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import timedelta
@@ -43,6 +43,8 @@ _LOG = logging.getLogger(__name__)
 
 FRESH_S = 3.0
 """Real seconds: an arm is present when it shows its token and its last state is no older than this."""
+MOST_STARTS, STARTS_S = 2, 5.0
+"""How often the states of an arm may begin again in that many real seconds: more often, two processes publish them."""
 MAX_NAMES, MAX_JOBS, MAX_ALARMS = 1024, 4096, 256
 ENDED: tuple[auction.JobState, ...] = ("finished", *auction.ABANDONED)
 """States of jobs that need nobody any more."""
@@ -118,6 +120,8 @@ class ArmSnapshot(msgspec.Struct, frozen=True):
     """Fleet seconds until it is home with its current job done."""
     away: bool = False
     """It reports that it is away from home."""
+    doubled: bool = False
+    """Two processes publish its states: their ticks go back and forth."""
     scores: dict[str, JobScore] = {}
     """Of the jobs that have not ended."""
     p_saturation: float | None = None
@@ -167,6 +171,8 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
     """Names of the spaces that are closed to other arms, by arm, from the last status reply."""
     paused: dict[str, str] = {}
     """Who paused an arm, by arm, from the last status reply; "*" for all arms."""
+    left_out: dict[str, str] = {}
+    """Why an arm is awarded no job for a while, by arm, from the last status reply."""
     speed: float | None = None
     """Fleet seconds per real second."""
     changes: dict[str, int] = {}
@@ -177,6 +183,8 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
     """Real seconds since this listener began."""
     lost_s: float | None = None
     """Real seconds since this listener lost its connection to the router; None if it has one."""
+    expiry: str = ""
+    """Sentence that the certificate of this listener has expired; "" if it has not."""
 
     @property
     def last_reply(self) -> tuple[str, float]:
@@ -196,10 +204,14 @@ class _Arm:
     heat_n2m2s: float = 0.0
     break_end_s: float | None = None
     events: Counter[str] = field(default_factory=Counter[str])
+    starts_s: deque[float] = field(default_factory=lambda: deque[float](maxlen=MOST_STARTS + 1))
+    """Real seconds of the last states with a lower tick than the one before."""
 
-    def follow(self, state: State) -> None:
+    def follow(self, state: State, now_s: float) -> None:
         """Add the time since the last state to the work and heat of the arm."""
         before, _ = self.last(State)
+        if before is not None and state.tick < before.tick:
+            self.starts_s.append(now_s)
         passed_s = 0.0 if before is None else state.time_s - before.time_s
         if before is not None and passed_s > 0.0 and state.epoch == before.epoch:
             self.worked_s += passed_s if before.mode == "working" else 0.0
@@ -210,6 +222,10 @@ class _Arm:
         self.events[event.kind if event.kind in EVENT_KINDS else "other"] += 1
         if event.kind in ("break", "break_end"):
             self.break_end_s = event.time_s + (event.value or 0.0) if event.kind == "break" else None
+
+    def is_doubled(self, now_s: float) -> bool:
+        """Return whether two processes publish its states."""
+        return len(self.starts_s) > MOST_STARTS and now_s - self.starts_s[0] <= STARTS_S
 
     def last(self, kind: type[Message]) -> tuple[Message | None, float]:
         message, at_s = self.messages.get(kind, (None, 0.0))
@@ -254,10 +270,13 @@ class FleetView:
     """Real second at which a listener began."""
     lost_s: float | None = None
     """Real second at which it lost its connection to the router; None if it has one."""
+    expiry: str = ""
+    """As in a snapshot."""
     _arms: "Recent[str, _Arm]" = field(default_factory=lambda: Recent(MAX_NAMES))
     _auctioneers: "Recent[str, _Auctioneer]" = field(default_factory=lambda: Recent(MAX_NAMES))
     _space: dict[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
     _paused: dict[str, str] = field(default_factory=dict[str, str])
+    _left_out: dict[str, str] = field(default_factory=dict[str, str])
     _jobs: "Recent[str, _Job]" = field(
         default_factory=lambda: Recent(MAX_JOBS, lambda job: job.status.state not in ENDED)
     )
@@ -287,7 +306,7 @@ class FleetView:
                 self.alarms[message.alarm] = message
         elif isinstance(message, State):
             arm = self._arm(name)
-            arm.follow(message)
+            arm.follow(message, now_s)
             arm.messages[State] = arm.sensors.check(message), now_s
         elif isinstance(message, DifficultyScores | Info | ArmEvent):
             if isinstance(message, ArmEvent):
@@ -303,7 +322,7 @@ class FleetView:
             for job in self._jobs.values():
                 job.number = 0
         auctioneer.heard_s, auctioneer.time_s, auctioneer.trouble = now_s, reply.time_s, reply.trouble
-        self._space, self._paused = dict(reply.space), dict(reply.paused)
+        self._space, self._paused, self._left_out = dict(reply.space), dict(reply.paused), dict(reply.left_out)
         for status in reply.jobs:
             self._set_status(status, now_s)
 
@@ -337,15 +356,15 @@ class FleetView:
             jobs=tuple(statuses[-jobs:]) if jobs > 0 else (),
             space=self._space,
             paused=dict(self._paused),
+            left_out=dict(self._left_out),
             speed=self.speed,
             alarms=tuple(self.alarms.values()),
             listened_s=_age_s(self.began_s, now_s) or 0.0,
             lost_s=_age_s(self.lost_s, now_s),
+            expiry=self.expiry,
         )
         unserved = why_unserved(now)
-        return replace(
-            now, arms=tuple(replace(arm, idle=why_idle(arm, waiting, self._paused, unserved)) for arm in now.arms)
-        )
+        return replace(now, arms=tuple(replace(arm, idle=why_idle(arm, waiting, now, unserved)) for arm in now.arms))
 
     def _pause(self, request: ControlRequest) -> None:
         """Apply a pause or its end, which the next status reply confirms."""
@@ -414,6 +433,7 @@ class FleetListener:
             self.view.lost_s = None
         elif self.view.lost_s is None:
             self.view.lost_s = asked_s
+        self.view.expiry = self._link.expiry
         if asked_s >= self._status_due_s:
             self._status_due_s = asked_s + STATUS_EVERY_S
             fleet, done = self._link.fleet, partial(self._statuses, asked_s)
@@ -485,26 +505,28 @@ def why_unserved(fleet: FleetSnapshot) -> str:
     return next((each.trouble for each in fleet.auctioneers if each.trouble and each.auctioneer == last), "")
 
 
-def why_idle(arm: ArmSnapshot, waiting: Mapping[str, str], paused: Mapping[str, str], unserved: str = "") -> str:
+def why_idle(arm: ArmSnapshot, waiting: Mapping[str, str], fleet: FleetSnapshot, unserved: str = "") -> str:
     """Why an arm has no job now; "" for one that has a job or is not present.
 
     Args:
         waiting: Reasons of the waiting jobs, by job.
-        paused: As in a snapshot.
+        fleet: Which arms are paused or left out.
         unserved: Why no arm gets a job.
     """
     if not arm.present or arm.job:
         return ""
-    if (pause := next((name for name in (ALL_ARMS, arm.arm) if name in paused), None)) is not None:
-        return f"It is paused{by_whom(paused[pause])}."
+    if (pause := next((name for name in (ALL_ARMS, arm.arm) if name in fleet.paused), None)) is not None:
+        return f"It is paused{by_whom(fleet.paused[pause])}."
     if arm.mode == "faulted":
         return "It is faulted."
     if arm.break_end_s is not None:
         return f"It is in a break until {timedelta(seconds=round(arm.break_end_s))} of fleet time."
     if arm.headroom_k is not None and arm.headroom_k <= 0.0:
-        return "It is above its warning limit."
+        return "Its temperatures are impossible." if arm.bad_sensor else "It is above its warning limit."
     if unserved:
         return unserved
+    if arm.arm in fleet.left_out:
+        return f"It {fleet.left_out[arm.arm]}."
     if not waiting:
         return "No job waits."
     named = next((f" {job}: {reason}" for job, reason in waiting.items() if arm.arm in reason), "")
@@ -553,6 +575,7 @@ def _arm_snapshot(name: str, arm: _Arm, now_s: float, speed: float | None, ended
         job=state.job if state else "",
         busy_s=state.busy_s if state else 0.0,
         away=bool(state and state.space),
+        doubled=arm.is_doubled(now_s),
         scores={job: score for job, score in by_job if job not in ended},
         joints=info.joints if info else None,
         twin=info.twin if info else "",

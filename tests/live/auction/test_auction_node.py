@@ -4,8 +4,10 @@ import re
 import time
 from contextlib import ExitStack
 from itertools import count
+from typing import Any, ClassVar
 
 import pytest
+from msgspec.structs import replace
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
@@ -187,6 +189,40 @@ class Bus:
 def bus(tmp_path):
     with ExitStack() as stack:
         yield Bus(stack, tmp_path)
+
+
+class WrongArm(Arm):
+    """An arm whose quotes have other fields."""
+
+    change: ClassVar[dict[str, Any]] = {}
+
+    def quote(self, request):
+        return replace(super().quote(request), **self.change)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"auction": "x"}, "quoted for another round"),
+        (
+            {"estimates": (JobEstimate("a", (PlanQuote(duration_s=0.0),)),)},
+            "gave no valid quote: Not a thermofleet.Quote",
+        ),
+        ({"estimates": (JobEstimate("a", (PlanQuote(finish_in_s=-1.0),)),)}, "Expected `float` >= 0"),
+        ({"estimates": ()}, "did not quote"),
+    ],
+)
+def test_what_is_wrong_with_a_quote_is_logged_once_and_is_the_reason_of_the_job(bus, caplog, change, says):
+    node = bus.auctioneer()
+    arm = WrongArm(bus.stack.enter_context(BusClient(bus.endpoint, "f")), "arm_0")
+    arm.change = change
+    bus.arms.append(arm)
+    submit(bus, "a")
+    bus.until(lambda: says in node.auctioneer.status(("a",))[0].reason)
+    bus.serve_for(1.0)
+    logged = [each.getMessage() for each in caplog.records if each.getMessage().startswith("Arm 'arm_0' ")]
+    assert len(logged) == 1
+    assert says in logged[0]
 
 
 TWICE = ("Started", "Started")

@@ -12,7 +12,7 @@ from fleet.bus.protocol.auction import JobStatus, Status
 from fleet.bus.protocol.operator import Alarm
 from fleet.errors import Refused
 from fleet.live.monitor.alarms import HOLD_S, AlarmList
-from fleet.live.monitor.health import Finding, check_awards, check_connection, check_jobs
+from fleet.live.monitor.health import Finding, check_arm, check_awards, check_connection, check_jobs
 from fleet.live.monitor.snapshot import MAX_ALARMS, FleetSnapshot, FleetView
 from scenarios.live.recorder import Recorder
 from scenarios.live.recording import alarms_of
@@ -157,6 +157,7 @@ def test_findings_without_a_kind_raise_no_alarm():
         ({}, {}, {"*": "ann"}, "It is paused by 'ann'."),
         ({"mode": "faulted"}, {}, {}, "It is faulted."),
         ({"headroom_k": -1.0}, {"j": "x"}, {}, "It is above its warning limit."),
+        ({"temp_c": (30.0, -300.0, 40.0), "headroom_k": -1.0}, {"j": "x"}, {}, "Its temperatures are impossible."),
         ({}, {}, {}, "No job waits."),
         (
             {},
@@ -175,6 +176,26 @@ def test_an_arm_without_a_job_says_why(change, waiting, paused, says):
     (arm,) = view.snapshot(0.0).arms
     assert arm.idle.startswith(says)
     assert bool(arm.idle) == bool(says)
+
+
+@pytest.mark.parametrize(
+    ("ticks", "doubled"),
+    [
+        ((100, 3, 101, 4, 102, 5), True),
+        ((100, 101, 1, 2, 3, 4), False),  # one restart
+        ((7, 7, 7, 7, 7, 7), False),
+    ],
+)
+def test_two_processes_under_the_name_of_one_arm_are_noticed(ticks, doubled):
+    view = FleetView("f")
+    view.set_token("arm", "a", True)
+    for number, tick in enumerate(ticks):
+        view.update("a", state(tick=tick, time_s=float(number)), 0.5 * number)
+    (arm,) = view.snapshot(3.0).arms
+    assert [each.what for each in check_arm(arm, None)] == doubled * [
+        "Two processes publish as arm a: its ticks go back and forth. Stop one."
+    ]
+    assert not view.snapshot(9.0).arms[0].doubled
 
 
 def test_work_and_heat_are_sums_over_the_time_between_states():
@@ -251,6 +272,8 @@ def test_a_listener_says_who_does_not_reply_and_why_nobody_awards_jobs():
     (lost,) = check_connection(view.snapshot(20.0))
     assert (lost.kind, lost.since_s) == ("connection", 2.0)
     assert lost.what.endswith("What is shown is from before, 2 s ago.")
+    view.expiry = "The certificate of 'm' expired."
+    assert check_connection(view.snapshot(20.0))[0].what.startswith("The certificate of 'm' expired. What is shown is")
 
 
 def test_an_absence_raises_an_alarm_once_it_lasts_and_the_end_of_the_shift_raises_none():

@@ -18,7 +18,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.router import Router
 from fleet.live.monitor.snapshot import ArmSnapshot, FleetSnapshot, JobScore
 from scenarios.live.fleet_processes import free_port
-from scenarios.show.watch import GONE_S, ShiftEnd, format_age, format_scores, screen
+from scenarios.show.watch import GONE_S, RESTORED_S, ShiftEnd, format_age, format_scores, screen
 from tests import commands
 from tests.waiting import PATIENCE_S
 
@@ -130,6 +130,30 @@ def test_the_end_of_a_shift_is_told_when_all_have_left():
     assert [end.check(fleet, 1.0) for fleet in (at_work, left)] == ["", ""]
     assert end.check(left, 99.0) == end.check(at_work, 99.5) == end.check(settled, 100.0) == ""
     assert end.check(settled, 100.0 + GONE_S) == "The shift has ended: 3 of 4 jobs finished, 1 given up."
+
+
+def test_participants_that_are_gone_with_the_connection_have_not_left():
+    end = ShiftEnd()
+    arm = ArmSnapshot("a", token=True, present=True)
+    present = FleetSnapshot("f", (arm,), (), {"finished": 4}, ())
+    gone = replace(present, arms=(replace(arm, token=False),))
+    assert end.check(present, 0.0) == ""
+    assert end.check(gone, 0.25) == ""  # the tokens go before the listener notices the loss
+    assert not any(end.check(replace(gone, lost_s=at_s - 0.25), at_s) for at_s in (0.5, 60.0))
+    assert not any(end.check(gone, at_s) for at_s in (60.25, 60.0 + GONE_S, 59.0 + RESTORED_S))
+    assert end.check(present, 60.0 + RESTORED_S) == ""
+    assert not any(end.check(replace(gone, lost_s=at_s - 80.0), at_s) for at_s in (80.0, 85.0))
+    assert not any(end.check(gone, at_s) for at_s in (85.25, 94.0))
+    assert end.check(gone, 85.0 + RESTORED_S) == "The shift has ended: 4 of 4 jobs finished."
+
+
+def test_participants_that_left_before_the_router_have_left():
+    end = ShiftEnd()
+    arm = ArmSnapshot("a", token=True, present=True)
+    present = FleetSnapshot("f", (arm,), (), {"finished": 4}, ())
+    gone = replace(present, arms=(replace(arm, token=False),))
+    assert end.check(present, 0.0) == end.check(gone, 0.25) == end.check(replace(gone, lost_s=0.0), 1.5) == ""
+    assert end.check(replace(gone, lost_s=1.75), 0.25 + GONE_S) == "The shift has ended: 4 of 4 jobs finished."
 
 
 @pytest.mark.ci_slow
