@@ -205,7 +205,10 @@ def check_connection(fleet: FleetSnapshot) -> list[Finding]:
     """Check that the listener has a connection to the router: without one a snapshot shows an earlier fleet."""
     if fleet.lost_s is None:
         return []
-    why = fleet.expiry.rstrip(".") or "The connection to the router is lost: the router has ended, or is unreachable"
+    why = (
+        fleet.expiry.rstrip(".")
+        or "The connection to the router is lost: the router has ended, hangs, or is unreachable"
+    )
     lost = f"{why}. What is shown is from before"
     what = f"{lost}, {fleet.lost_s:.0f} s ago."
     return [Finding("fault", what, "connection", since_s=fleet.lost_s, lasting=f"{lost}.")]

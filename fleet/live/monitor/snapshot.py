@@ -43,6 +43,9 @@ _LOG = logging.getLogger(__name__)
 
 FRESH_S = 3.0
 """Real seconds: an arm is present when it shows its token and its last state is no older than this."""
+QUIET_S = 2.5
+"""Real seconds without any message after which a listener to several arms has no connection: before they count as
+absent."""
 MOST_STARTS, STARTS_S = 2, 5.0
 """How often the states of an arm may begin again in that many real seconds: more often, two processes publish them."""
 MAX_NAMES, MAX_JOBS, MAX_ALARMS = 1024, 4096, 256
@@ -268,6 +271,8 @@ class FleetView:
     """Fleet seconds per real second; None while unknown."""
     began_s: float | None = None
     """Real second at which a listener began."""
+    heard_s: float = math.inf
+    """Real second at which anything arrived there last."""
     lost_s: float | None = None
     """Real second at which it lost its connection to the router; None if it has one."""
     expiry: str = ""
@@ -312,6 +317,17 @@ class FleetView:
             if isinstance(message, ArmEvent):
                 self._arm(name).count(message)
             self._arm(name).messages[type(message)] = message, now_s
+
+    def follow_connection(self, connected: bool, now_s: float) -> None:
+        """Note whether the listener has a connection: a router that hangs keeps it, and forwards nothing.
+
+        Arms that publish states do not all fall silent in the same second, with whoever replies about the jobs.
+        """
+        telling = sum(arm.token and State in arm.messages for arm in self._arms.values())
+        if connected and not (telling > 1 and now_s - self.heard_s > QUIET_S):
+            self.lost_s = None
+        elif self.lost_s is None:
+            self.lost_s = now_s
 
     def update_jobs(self, reply: Status, now_s: float) -> None:
         """Apply the auctioneer's reply to a status request."""
@@ -429,11 +445,6 @@ class FleetListener:
     def serve(self, until_s: float) -> None:
         """Handle messages until the real second `until_s`; request the fleet's clock and all jobs when that is due."""
         asked_s = time.monotonic()
-        if self._link.connected:
-            self.view.lost_s = None
-        elif self.view.lost_s is None:
-            self.view.lost_s = asked_s
-        self.view.expiry = self._link.expiry
         if asked_s >= self._status_due_s:
             self._status_due_s = asked_s + STATUS_EVERY_S
             fleet, done = self._link.fleet, partial(self._statuses, asked_s)
@@ -443,7 +454,10 @@ class FleetListener:
             except BusError as error:
                 _LOG.warning("%s", error)
         while time.monotonic() < until_s:
-            self._link.serve(until_s)
+            if self._link.serve(until_s):
+                self.view.heard_s = time.monotonic()
+        self.view.follow_connection(self._link.connected, time.monotonic())
+        self.view.expiry = self._link.expiry
 
     def _message(self, topic: str, name: str, message: msgspec.Struct) -> None:
         self.view.update(name, message, time.monotonic())

@@ -268,6 +268,18 @@ def test_a_listener_says_who_does_not_reply_and_why_nobody_awards_jobs():
     assert stopped.what == view.snapshot(17.0).arms[0].idle == "The disk is full."
     view.update_jobs(Status("au", 2.0, ()), 18.0)
     assert check_awards(view.snapshot(18.0)) == check_connection(view.snapshot(18.0)) == []
+    view.set_token("arm", "b", True)
+    view.heard_s = 18.0
+    for connected, second, lost_s in ((True, 25.0, None), (False, 26.0, 26.0), (True, 27.0, None)):
+        view.follow_connection(connected, second)
+        assert view.lost_s == lost_s
+    view.update("b", state(), 18.0)
+    for second, lost_s in ((20.5, None), (20.6, 20.6), (22.0, 20.6)):  # the router hangs
+        view.follow_connection(True, second)
+        assert view.lost_s == lost_s
+    view.heard_s = 23.0
+    view.follow_connection(True, 23.0)
+    assert view.lost_s is None
     view.lost_s = 18.0
     (lost,) = check_connection(view.snapshot(20.0))
     assert (lost.kind, lost.since_s) == ("connection", 2.0)
