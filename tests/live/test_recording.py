@@ -23,7 +23,16 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
 from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import Alarm, Cancel, Change, ControlRequest, Operation, Pause, Resume, Settle
+from fleet.bus.protocol.operator import (
+    Alarm,
+    Cancel,
+    Change,
+    ControlRequest,
+    Operation,
+    Pause,
+    Resume,
+    Settle,
+)
 from fleet.bus.router import Router
 from fleet.errors import FleetError
 from fleet.events import Event
@@ -31,7 +40,7 @@ from fleet.live.job_rules import EXPIRED
 from fleet.robot import ThermalLimits
 from scenarios.cli.main import main
 from scenarios.live.recorder import SWEEP_S, GapFetcher, Recorder, record
-from scenarios.live.recording import CARD, alarms_of, open_messages, read_card, read_parts, replay
+from scenarios.live.recording import CARD, SOURCES, alarms_of, open_messages, read_card, read_parts, replay
 from scenarios.live.recording_report import heat_use, open_recording, order_events
 from scenarios.result_folder import lock_folder
 from scenarios.run.records import JobRecord, ShiftLog, schedule
@@ -108,8 +117,31 @@ def test_events_are_sought_of_an_arm_that_is_known_by_its_states_alone(tmp_path)
     recorder.add("a", state("a", 1))
     link = MagicMock(fleet="f", subscribe=lambda key, *_, **__: asked.append(key))
     GapFetcher(recorder, lambda: link).step(time.monotonic() + SWEEP_S)
-    of_auctioneers = [keys.of_every("f", "auction", topic) for topic in ("result", "operation")]
-    assert asked == [*of_auctioneers, keys.of_arm("f", "a", "event")]
+    unknown = [keys.of_every("f", *each) for each in (("auction", "result"), ("auction", "operation"))]
+    assert asked[:3] == [*unknown, keys.of_every("f", "arm", "operation")]
+    assert [key for key in asked[3:] if "/arm/" in key] == [
+        keys.of_arm("f", "a", each) for each in ("event", "operation")
+    ]
+
+
+def test_the_requests_that_arms_publish_without_an_auctioneer_are_kept_once(tmp_path):
+    """They have no number: caches repeat them after a later one, and after a restart of the recorder."""
+    sent = [
+        Operation(arm, time_s, ControlRequest(name, Pause(), "ann"))
+        for arm, time_s, name in (("a", 5.0, "1"), ("a", 5.0, "2"), ("b", 4.0, "1"), ("a", 9.0, "3"))
+    ]
+    link = MagicMock(fleet="f")
+    for _ in range(2):
+        recorder = Recorder.open(tmp_path, "f")
+        for source in SOURCES:
+            recorder.subscribe(link, source)
+        handle = next(call.args[2] for call in link.subscribe.mock_calls if call.args[0].endswith("/arm/*/operation"))
+        for operation in (*sent, *sent[:2]):
+            handle(operation.auctioneer, operation)
+        recorder.write()
+    assert sorted(map(repr, open_messages(tmp_path))) == sorted(map(repr, sent))
+    count = recorder.counts["operations of a"]
+    assert (count.kept, count.missed, recorder.missing) == (3, 0, [])
 
 
 def test_messages_of_a_restarted_arm_are_kept(tmp_path):
@@ -285,6 +317,21 @@ def test_a_replay_publishes_the_same_messages_and_refuses_names_of_present_arms(
             replay(messages, other, speed=100.0, stopped=lambda: False)
     for kind in ("telemetry", "events", "results"):
         assert read_parts(tmp_path / "second", kind).equals(read_parts(tmp_path / "first", kind)), kind
+
+
+def test_a_replay_publishes_a_request_under_the_key_of_its_arm_or_auctioneer(tmp_path):
+    recorder = Recorder.open(tmp_path, "f")
+    recorder.add("a", state("a", 1))
+    recorder.add("boss", operation(1))
+    recorder.add_unnumbered("a", Operation("a", 2.0, ControlRequest("pause", Pause(), "ann")))
+    recorder.write()
+    link = MagicMock(fleet="f")
+    link.tokens.return_value = set()
+    assert replay(open_messages(tmp_path), link, speed=100.0, stopped=lambda: False) == 3
+    of_requests = {
+        call.args[0] for call in link.publisher.mock_calls if len(call.args) == 2 and call.args[1] is Operation
+    }
+    assert of_requests == {keys.of_auction("f", "boss", "operation"), keys.of_arm("f", "a", "operation")}
 
 
 def test_two_recorders_cannot_share_a_folder(tmp_path):
