@@ -29,17 +29,19 @@ from fleet.live.job_rules import EXPIRED
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
 from scenarios.live.cell import described_model
-from scenarios.live.recording import Kind, alarms_of, lost_rows, read_card, read_parts
+from scenarios.live.recording import Kind, SenderCount, alarms_of, lost_rows, read_card, read_parts
 from scenarios.run.log import UNITS, joint_values
 from scenarios.run.records import SAME_MOMENT_DIGITS, Halt, JobRecord, Notice, Offer, ShiftLog
 from scenarios.show.run_page import report_html
-from scenarios.show.words import clock
+from scenarios.show.words import clock, names_text
 from scenarios.spec.schema import Scenario
 
 MOST_SAMPLES = 20_000
 """Samples of telemetry in a report, in time."""
 ABSENT_SAMPLES = 30
 """Without a state for this many typical intervals, an arm has no temperature in the report."""
+TELEMETRY = "telemetry of "
+"""Before the name of an arm, its states in the card."""
 _ENDED = ("waiting", "given_up", "unfinished", "cancelled")
 """States of a job in which the arm that had it has it no more."""
 
@@ -67,12 +69,13 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
         FleetError: it is no recording, has no states of arms yet, or has arms that the scenario does not have.
     """
     card = read_card(folder)
-    epochs = dict.fromkeys(epoch for count in card.senders.values() for epoch in count.epochs)
+    epochs = epochs_of(card.senders)
     kinds: tuple[Kind, ...] = ("telemetry", "events", "results", "operations")
-    table, log, results, operations = (_of_epoch(read_parts(folder, kind), [*epochs]) for kind in kinds)
+    table, log, results, operations = (_of_epoch(read_parts(folder, kind), epochs) for kind in kinds)
     arms = tuple(sorted(set(table["arm"].to_pylist())))
     if not arms:
-        raise FleetError(f"'{folder}' holds no state of an arm yet; record longer.")
+        which = f" of the epoch {epochs[-1]}" if epochs else ""
+        raise FleetError(f"'{folder}' holds no state of an arm{which} yet; record longer.")
     limits, model = _cell(scenario, card.cell, arms)
     alarms = alarms_of(folder) if len(epochs) < 2 else []  # they name no epoch
     ordered = order_events(arm_events(log), _returns(results))
@@ -92,15 +95,11 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
         "policy": "live recording",
         "metrics": _metrics(telemetry, events, jobs, arms, limits.warning_c) | heat_use(table, arms),
         "messages": {
-            sender: f"{count.kept} recorded, {count.missed} missing" for sender, count in card.senders.items()
+            sender: f"{count.kept} recorded, {count.missed} missing" for sender, count in sorted(card.senders.items())
         },
         "missing": _missing(read_parts(folder, "gaps"), lost_rows(folder)),
         "jobs submitted by": _submitters(results),
     }
-    if len(epochs) > 1:
-        shown["epochs"] = (
-            f"{len(epochs)} are recorded here; this page shows the last one, {[*epochs][-1]}, without alarms"
-        )
     return RecordingLog(
         card=shown,
         arms=arms,
@@ -112,8 +111,43 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
         halts=tuple(_halts(alarms, operations, results["time_s"].to_pylist(), arms)),
         ended_s=min((row["time_s"] for row in results.to_pylist() if row["shift_ended"]), default=math.inf),
         offers=tuple(offer for row in results.to_pylist() for offer in offers_of(row)),
+        remarks=tuple(_left_out(epochs, card.senders)),
         model=model,
     )
+
+
+def epochs_of(senders: Mapping[str, SenderCount]) -> tuple[str, ...]:
+    """Epochs of the fleet in the order in which they began, as those who allocate jobs published them.
+
+    Without an auctioneer they are those of most arms; so is one in which an auctioneer has published nothing yet. One
+    arm alone may publish a wrong one.
+    """
+    central = [count for name, count in senders.items() if name.startswith(("results of ", "operations of "))]
+    allocated = tuple(dict.fromkeys(epoch for count in central for epoch in count.epochs))
+    own = [count.epochs for name, count in senders.items() if name.startswith(TELEMETRY) and count.epochs]
+    if not own:
+        return allocated
+    arms, last = Counter(epoch for epochs in own for epoch in epochs), Counter(epochs[-1] for epochs in own)
+    newest = max(last, key=lambda epoch: (last[epoch], arms[epoch]))
+    if not allocated:
+        return (*(epoch for epoch, count in arms.items() if epoch != newest and 2 * count > len(own)), newest)
+    begun = newest not in allocated and last[newest] > max(1.0, len(own) / 2)
+    return (*allocated, newest) if begun else allocated
+
+
+def _left_out(epochs: Sequence[str], senders: Mapping[str, SenderCount]) -> Iterator[str]:
+    """What the report leaves out, in sentences."""
+    if len(epochs) > 1:
+        which = f"{len(epochs)} epochs are recorded; this page shows the last one, {epochs[-1]}"
+        yield f"{which}, without alarms, which name no epoch."
+    others = {
+        name.removeprefix(TELEMETRY): other
+        for name, count in sorted(senders.items())
+        if name.startswith(TELEMETRY) and (other := [epoch for epoch in count.epochs if epoch not in epochs])
+    }
+    if others:
+        names = names_text([*dict.fromkeys(epoch for other in others.values() for epoch in other)])
+        yield f"{names_text([*others])} published states of another epoch, {names}: this page leaves them out."
 
 
 def _cell(
@@ -375,9 +409,9 @@ def _missing(gaps: pa.Table, lost: Mapping[Kind, int]) -> Mapping[str, str]:
     return missing or {"": "none"}
 
 
-def _of_epoch(table: pa.Table, epochs: list[str]) -> pa.Table:
-    """Rows of the last of several epochs, each of which begins its time again."""
-    if len(epochs) < 2:
+def _of_epoch(table: pa.Table, epochs: Sequence[str]) -> pa.Table:
+    """Rows of the last epoch, each of which begins its time again."""
+    if not epochs:
         return table
     return table.filter(pc.field("epoch").isin(["", epochs[-1]]))  # "": before an arm knew it
 

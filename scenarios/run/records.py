@@ -320,6 +320,8 @@ class ShiftLog:
     halts: tuple[Halt, ...] = ()
     ended_s: float = inf
     """End of the shift, if it was before the last reading."""
+    remarks: tuple[str, ...] = ()
+    """What its records leave out, in sentences."""
 
     @cached_property
     def begin(self) -> datetime | None:

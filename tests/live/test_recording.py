@@ -41,7 +41,7 @@ from fleet.robot import ThermalLimits
 from scenarios.cli.main import main
 from scenarios.live.recorder import SWEEP_S, GapFetcher, Recorder, record
 from scenarios.live.recording import CARD, SOURCES, alarms_of, open_messages, read_card, read_parts, replay
-from scenarios.live.recording_report import heat_use, open_recording, order_events
+from scenarios.live.recording_report import epochs_of, heat_use, open_recording, order_events
 from scenarios.result_folder import lock_folder
 from scenarios.run.records import JobRecord, ShiftLog, schedule
 from scenarios.show.run_page import late_jobs, lateness_text, report_html, verdict
@@ -551,16 +551,72 @@ def test_a_returned_job_is_late_by_the_reason_of_its_return(tmp_path):
     assert lateness_text(log, late_jobs(log)).endswith("arm_0 returned it at 0:01:10: its arm was paused by 'ann'.")
 
 
-def test_the_report_of_two_epochs_shows_the_last_one(tmp_path):
+@pytest.mark.parametrize(("first", "last"), [("one", "two"), ("two", "one")])
+def test_the_report_of_two_epochs_shows_the_last_one(tmp_path, first, last):
+    """Whatever their names are, and although the recorder was restarted since."""
     recorder = record_events(tmp_path / "r", ())
-    for epoch, time_s in (("one", 0.0), ("two", 5.0)):
-        for number, job in enumerate(("x", "y") if epoch == "one" else ("z",)):
+    for epoch, time_s in ((first, 5.0), (last, 0.0)):
+        for number, job in enumerate(("x", "y") if epoch == first else ("z",)):
             status = JobStatus(job, "finished", arm="arm_0")
             recorder.add("boss", Result("boss", number, time_s, status, epoch=epoch))
+        recorder.write()
+        recorder = Recorder.open(tmp_path / "r", "shop")
     recorder.write(status="finished")
     html = open_recording(tmp_path / "r").page()
-    assert "this page shows the last one, two" in html
+    assert f"2 epochs are recorded; this page shows the last one, {last}, without alarms" in html
     assert "<dt>jobs finished</dt><dd>1 of 1</dd>" in html
+
+
+def test_an_epoch_without_a_result_has_begun_when_most_arms_have_it(tmp_path):
+    """After a lost journal an auctioneer publishes nothing before the first job."""
+    recorder = record_events(tmp_path / "r", ())
+    status = JobStatus("x", "finished", arm="arm_0")
+    recorder.add("boss", Result("boss", 0, 5.0, status, epoch="two"))
+    for arm, shown in zip(ARMS, ("two", "one"), strict=True):
+        add_states(recorder, arm, [""] * 9, epoch="one", first_s=200.0)
+        recorder.write()
+        assert epochs_of(read_card(tmp_path / "r").senders)[-1] == shown
+    log = open_recording(tmp_path / "r")
+    assert log.remarks[0].startswith("2 epochs are recorded; this page shows the last one, one,")
+    assert log.card["metrics"]["finished"] == 0
+
+
+def add_states(recorder, arm, jobs, *, epoch="now", first_s=0.0):
+    """A state a second of one start of an arm, with these jobs."""
+    for tick, job in enumerate(jobs):
+        message = State(arm, tick, first_s + tick, "idle", (30.0,) * 7, 30.0, job=job, epoch=epoch)
+        recorder.add(arm, message)
+
+
+@pytest.mark.parametrize("central", [True, False])
+def test_one_arm_with_states_of_another_epoch_does_not_empty_the_report(tmp_path, central):
+    recorder = Recorder.open(tmp_path, "shop")
+    for arm, epoch in (("arm_0", "zzz"), ("arm_1", "now"), ("arm_2", "now")):
+        add_states(recorder, arm, [""] * 50, epoch=epoch)
+    recorder.add("arm_1", ArmEvent("arm_1", 10**9 + 1, 3.0, "award", "x", epoch="now"))
+    recorder.add("arm_1", ArmEvent("arm_1", 10**9 + 2, 9.0, "finish", "x", value=0.0, epoch="now"))
+    if central:
+        recorder.add("boss", Result("boss", 0, 9.0, JobStatus("x", "finished", arm="arm_1"), epoch="now"))
+    recorder.write(status="finished")
+    log = open_recording(tmp_path)
+    assert log.arms == ("arm_1", "arm_2")
+    assert log.card["metrics"]["finished"] == 1
+    assert verdict(log).sentences[0] == "arm_0 published states of another epoch, zzz: this page leaves them out."
+
+
+def test_most_arms_tell_the_last_epoch_without_an_auctioneer(tmp_path):
+    """The names of the epochs and the time since their begin do not; an arm is absent since the first one."""
+    recorder = Recorder.open(tmp_path, "shop")
+    for arm in ("arm_0", "arm_1", "arm_2"):
+        add_states(recorder, arm, [""] * 50, epoch="two", first_s=100.0)
+    for arm in ("arm_1", "arm_2"):
+        add_states(recorder, arm, [""] * 5, epoch="one")
+    recorder.write(status="finished")
+    log = open_recording(tmp_path)
+    assert log.arms == ("arm_1", "arm_2")
+    assert log.remarks == (
+        "2 epochs are recorded; this page shows the last one, one, without alarms, which name no epoch.",
+    )
 
 
 kinds = st.sampled_from(["award", "finish", "home", "fault", "recover", "return", "warning", "moved"])
