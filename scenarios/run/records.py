@@ -240,10 +240,11 @@ class JobRecord:
     release_s: float
     """NaN if it was not recorded."""
     due_s: float
-    """Infinite without a due date."""
+    """Infinite without a due date, NaN if it was not recorded."""
     finished_s: float | None
     """None if it was not finished."""
     value: float
+    """NaN if it was not recorded."""
     payload_kg: float
     cycles: int
 

@@ -390,6 +390,7 @@ NOTABLE = (
     "cancel",
     "settle",
     "change",
+    "clear",
     "recover",
     "return",
     "break",

@@ -27,6 +27,7 @@ from fleet.bus.protocol.operator import (
     Alarm,
     Cancel,
     Change,
+    Clear,
     ControlRequest,
     Operation,
     Pause,
@@ -615,8 +616,79 @@ def test_most_arms_tell_the_last_epoch_without_an_auctioneer(tmp_path):
     log = open_recording(tmp_path)
     assert log.arms == ("arm_1", "arm_2")
     assert log.remarks == (
-        "2 epochs are recorded; this page shows the last one, one, without alarms, which name no epoch.",
+        "2 epochs are recorded; this page shows the last one, one, without alarms and requests that name no epoch.",
     )
+
+
+def record_peers(folder, jobs, events=(), actions=()):
+    """A log of arms without an auctioneer: states of arm_0 with these jobs, in a list for each of its starts."""
+    recorder = Recorder.open(folder, "shop")
+    begun_s = 0.0
+    for names in jobs:
+        add_states(recorder, "arm_0", names, first_s=begun_s)
+        begun_s += len(names) + 5.0
+    add_states(recorder, "arm_1", [""] * 100)
+    for number, (time_s, kind, job, *reason) in enumerate(events, start=1):
+        fields = {"value": 0.0} if kind in ("award", "finish") else {"reason": "".join(reason)}
+        recorder.add("arm_0", ArmEvent("arm_0", number, time_s, kind, job, epoch="now", **fields))
+    for time_s, action in actions:
+        recorder.add_unnumbered("arm_1", Operation("arm_1", time_s, ControlRequest(str(time_s), action, "ann")))
+    recorder.write(status="finished")
+    return open_recording(folder)
+
+
+NEXT_JOB = [(1.0, "award", "x"), (40.0, "award", "y"), (60.0, "finish", "y"), (62.0, "home", "y")]
+AT_WORK = [""] + ["x"] * 19
+"""States until 20 s."""
+
+
+@pytest.mark.parametrize(
+    ("jobs", "events", "actions", "end_s", "reason"),
+    [
+        ([AT_WORK + [""] * 80], [], [(12.0, Pause()), (35.0, Resume())], 20.0, "all arms were paused by ann"),
+        ([AT_WORK + [""] * 80], [], [(12.0, Cancel("x"))], 20.0, "it was cancelled by 'ann'"),
+        ([AT_WORK + [""] * 80], [(15.0, "break", "", "lunch")], [], 20.0, "a break, 'lunch'"),
+        ([AT_WORK, [""] * 75], [], [], 19.0, "the arm was restarted"),
+        ([AT_WORK], [], [], 19.0, "no later state of the arm is recorded"),
+        ([AT_WORK + [""] * 80], [], [(2.0, Cancel("z")), (30.0, Pause())], 20.0, "the reason is not recorded"),
+    ],
+)
+def test_without_an_auctioneer_a_job_is_returned_when_and_why_the_records_tell(
+    tmp_path, jobs, events, actions, end_s, reason
+):
+    """The arm goes on with another job long after that, if it is there."""
+    later = NEXT_JOB if len(jobs[-1]) > 20 else NEXT_JOB[:1]
+    log = record_peers(tmp_path, jobs, sorted([*later, *events]), actions)
+    (back,) = [event for event in log.events if event.kind == "return"]
+    assert (back.job, back.time_s, back.reason) == ("x", end_s, reason)
+    spans = [(span.job, span.start_s, span.end_s, span.outcome) for span in log.plan.assignments]
+    assert spans == [("x", 1.0, end_s, "returned"), ("y", 40.0, 62.0, "finished")][: len(later)]
+
+
+def test_an_end_that_no_state_shows_is_at_the_next_award_and_its_reason_unknown(tmp_path):
+    log = record_peers(tmp_path, [[""] * 100], NEXT_JOB)
+    assert [(e.time_s, e.reason) for e in log.events if e.kind == "return"] == [(40.0, "the reason is not recorded")]
+
+
+def test_without_an_auctioneer_a_report_has_what_people_requested(tmp_path):
+    """A job that was settled as done is finished, a cancelled one in the report; a changed due date counts."""
+    actions = [
+        (5.0, Change("y", due_s=50.0)),
+        (6.0, Cancel("gone")),
+        (7.0, Pause("arm_0")),
+        (8.0, Clear("arm_2")),
+        (9.0, Settle("x", "done")),
+        (10.0, Cancel("y")),
+        (11.0, Settle("again", "done")),
+        (12.0, Settle("again", "redo")),
+    ]
+    log = record_peers(tmp_path, [AT_WORK + [""] * 80], NEXT_JOB, actions)
+    metrics = log.card["metrics"]
+    assert {job.job: job.state for job in log.jobs} == {"gone": "cancelled", "x": "finished", "again": "waiting"}
+    assert (metrics["jobs"], metrics["finished"], metrics["tardiness_min"]) == (4, 2, 10.0 / 60.0)
+    assert [(late.job, late.late_s) for late in late_jobs(log)] == [("y", 10.0)]
+    kinds = [row[1] for row in listed_events(log.page()) if row[4].endswith(", by ann") or row[4] == "by ann"]
+    assert kinds == ["change", "cancel", "pause", "clear", "settle", "cancel", "settle", "settle"]
 
 
 kinds = st.sampled_from(["award", "finish", "home", "fault", "recover", "return", "warning", "moved"])
