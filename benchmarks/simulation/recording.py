@@ -1,7 +1,9 @@
 """The recorder of a simulated fleet, and the rules of a recording.
 
 A message that was published is in the recording once, as it was published, or a row says that it is missing; a message
-that its publisher still has cached is not missing. The recording is read by the product, from a copy on a real disk.
+that its publisher still has cached is not missing. Operations of arms have no number: their name takes its place, and
+one that its publisher has no longer cached may be missing without a row. The recording is read by the product, from a
+copy on a real disk.
 """
 
 import io
@@ -31,6 +33,18 @@ from scenarios.live.recording import Kind, read_card, read_parts
 RECORDER = "recorder"
 NAMES: dict[Kind, str] = {"results": "auctioneer", "operations": "auctioneer", "events": "arm"}
 """Column with the sender, by kind."""
+Number = int | str
+"""Number of a message, or the name of an arm's operation."""
+
+
+def _number_of(key: str, message: Any) -> Number:
+    if isinstance(message, Operation) and keys.parse(key).role == "arm":
+        return message.request.request
+    return message.number
+
+
+def _number_of_row(row: dict[str, Any]) -> Number:
+    return row["request"] if "request" in row and not row["epoch"] else row["number"]  # an auctioneer has an epoch
 
 
 def recorder_process(rotate_s: float) -> Callable[[Process], RecorderNode]:
@@ -67,18 +81,17 @@ class Sent:
     """What was published, by kind, sender and number, and where it may be cached."""
 
     def __init__(self, bus: Bus) -> None:
-        self.messages: dict[tuple[Kind, str, int], msgspec.Struct] = {}
+        self.messages: dict[tuple[Kind, str, Number], msgspec.Struct] = {}
         self.cached: dict[str, Any] = {}
         bus.on_publish = self._add
 
     def _add(self, published: Published, message: msgspec.Struct) -> None:
-        if isinstance(message, Operation) and keys.parse(published.key).role == "arm":
-            return  # not recorded, and not counted
+        number = _number_of(published.key, message) if isinstance(message, Result | Operation | ArmEvent) else ""
         if isinstance(message, Result | Operation):
             kind: Kind = "results" if isinstance(message, Result) else "operations"
-            key: tuple[Kind, str, int] = kind, message.auctioneer, message.number
+            key: tuple[Kind, str, Number] = kind, message.auctioneer, number
         elif isinstance(message, ArmEvent):
-            key = "events", message.arm, message.number
+            key = "events", message.arm, number
         else:
             return
         self.cached[published.key] = published
@@ -91,10 +104,14 @@ class Sent:
             return ["it is down"]
         recorder = node.recorder
         seeks = [f"'{gap.sender}' is sought from {gap.first} to {gap.last}" for gap in recorder.missing]
-        last = {f"{kind} of {name}": number for kind, name, number in sorted(self.messages) if kind != "events"}
+        numbered = sorted((kind, name, number) for kind, name, number in self.messages if isinstance(number, int))
+        last = {f"{kind} of {name}": number for kind, name, number in numbered if kind != "events"}
         last |= {f"events of {own.name}": own.cache[-1][1].number for own in self.cached.values() if _has_events(own)}
         heard = {name.partition(", epoch")[0]: count.last for name, count in recorder.counts.items()}
-        return seeks + [f"'{name}' {number}" for name, number in last.items() if heard.get(name) != number]
+        seeks += [f"'{name}' {number}" for name, number in last.items() if heard.get(name) != number]
+        kept = {(name, request) for name, count in recorder.counts.items() for _, request in count.requests}
+        named = [(f"{kind} of {name}", number) for kind, name, number in sorted(self._in_caches(), key=str)]
+        return seeks + [f"{each}" for each in named if isinstance(each[1], str) and each not in kept]
 
     def check(self, process: Process) -> None:
         """Check the recording of an ended recorder.
@@ -112,40 +129,52 @@ class Sent:
             for kind, name in NAMES.items():
                 rows = read_parts(folder, kind).to_pylist()
                 self._check_kind(kind, rows, name)
-                lost = {(of, n) for what, of, row in gaps if what == kind for n in range(row["first"], row["last"] + 1)}
-                self._check_missing(kind, {(row[name], row["number"]) for row in rows}, lost)
+                lost: set[tuple[str, Number]] = {
+                    (of, n) for what, of, row in gaps if what == kind for n in range(row["first"], row["last"] + 1)
+                }
+                self._check_missing(kind, {(row[name], _number_of_row(row)) for row in rows}, lost)
+
+    def _in_caches(self) -> set[tuple[Kind, str, Number]]:
+        """Kind, sender and number of the messages that their publishers have cached."""
+        kinds: dict[str, Kind] = {"result": "results", "operation": "operations", "event": "events"}
+        return {
+            (kinds[keys.parse(published.key).topic], published.name, _number_of(published.key, message))
+            for published in self.cached.values()
+            if published.client.open_
+            for _, message in published.cache
+        }
 
     def _check_kind(self, kind: Kind, rows: list[dict[str, Any]], name: str) -> None:
-        counts = Counter((row[name], row["number"]) for row in rows)
+        counts = Counter((row[name], _number_of_row(row)) for row in rows)
         for (sender, number), count in counts.items():
             if count > 1:
                 raise Violation(f"{kind} {number} of '{sender}' is recorded {count} times.")
         for row in rows:
-            sent = self.messages.get((kind, row[name], row["number"]))
+            number = _number_of_row(row)
+            sent = self.messages.get((kind, row[name], number))
             if sent is None:
-                raise Violation(f"{kind} {row['number']} of '{row[name]}' is recorded, and was never published.")
+                raise Violation(f"{kind} {number} of '{row[name]}' is recorded, and was never published.")
             if isinstance(sent, Result) and (sent.status.job, sent.status.state) != (row["job"], row["state"]):
-                raise Violation(f"{kind} {row['number']} of '{row[name]}' is recorded as something else.")
+                raise Violation(f"{kind} {number} of '{row[name]}' is recorded as something else.")
 
-    def _check_missing(self, kind: Kind, kept: set[tuple[str, int]], lost: set[tuple[str, int]]) -> None:
-        cached = {
-            (published.name, message.number)
-            for published in self.cached.values()
-            if published.client.open_ and published.key.endswith(f"/{kind[:-1]}")
-            for _, message in published.cache
-        }
+    def _check_missing(self, kind: Kind, kept: set[tuple[str, Number]], lost: set[tuple[str, Number]]) -> None:
+        cached = {(of, number) for what, of, number in self._in_caches() if what == kind}
         if both := lost & kept:
             raise Violation(f"{kind} {min(both)} is recorded, and a row says that it is missing.")
         if vain := lost & cached:
             raise Violation(f"{kind} {min(vain)} is called missing, and its publisher has it.")
         last: dict[tuple[str, int], int] = {}
         for of, number in kept:
-            boot = (of, number // EVENTS_PER_BOOT)
-            last[boot] = max(last.get(boot, -1), number)
+            if isinstance(number, int):
+                boot = (of, number // EVENTS_PER_BOOT)
+                last[boot] = max(last.get(boot, -1), number)
         for what, of, number in self.messages:
             if what != kind or (of, number) in kept or (of, number) in lost:
                 continue
-            if kind != "events" or (of, number) in cached or number < last.get((of, number // EVENTS_PER_BOOT), -1):
+            noticed = isinstance(number, int) and (
+                kind != "events" or number < last.get((of, number // EVENTS_PER_BOOT), -1)
+            )
+            if noticed or (of, number) in cached:
                 raise Violation(f"{kind} {number} of '{of}' is not recorded, and no row says so.")
 
 

@@ -94,14 +94,14 @@ def check_journals(arm: str, number: int, epoch: str, histories: Iterable[Histor
 
 
 def history_of(arm: str, book: JobBook) -> History:
-    """Return the finished jobs, and those with permission to commit, as many as one message holds."""
+    """Return the jobs that finished last, and those with permission to commit, as many as one message holds."""
     reason = f"The journals of its arm were lost; '{arm}' had granted it permission to commit."
     committed = tuple(
         JobOutcome(entry.name, entry.award, grant.record.arm, "unfinished", entry.cycles, book.time_s, reason)
         for entry in book.jobs.values()
         if (grant := entry.grant) is not None and grant.may_commit
     )[:MOST_JOBS]
-    entries = (book.jobs[name] for name in book.in_order if book.is_finished(name))
+    entries = (book.jobs[name] for _, name in book.settled if book.is_finished(name))
     jobs = [job for entry in entries if (job := entry.original) is not None]
     return with_finished(History(arm, book.epoch, (), claims=dict(book.numbers), committed=committed), jobs)
 

@@ -2,7 +2,8 @@
 
 Messages are durable once they are in a Parquet part; the card names the last complete part, so a crash duplicates no
 row. Every sender numbers its messages: repeated ones are dropped, missing ones are fetched from the caches of the
-publishers (`GapFetcher`), also those that a crash of the recorder lost, and lost ones become a row of `gaps`.
+publishers (`GapFetcher`), also those that a crash of the recorder lost, and lost ones become a row of `gaps`. Only the
+operations of arms have no number: repeated ones are recognised by time and name, and lost ones are not noticed.
 """
 
 import logging
@@ -14,7 +15,6 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
 import pyarrow.parquet as pq
 from msgspec import structs
@@ -39,6 +39,7 @@ from scenarios.live.recording import (
     Message,
     RecordingCard,
     SenderCount,
+    Source,
     part_file,
     read_card,
     to_row,
@@ -162,6 +163,17 @@ class Recorder:
         if self.waiting < MAX_WAITING and self._take(message):
             self._rows.append(message)
 
+    def add_unnumbered(self, sender: str, message: Message) -> None:
+        """Keep an operation of an arm, unless it was kept before or memory is full."""
+        assert isinstance(message, Operation), "all other messages have numbers"
+        if self.waiting < MAX_WAITING and self._take_unnumbered(message):
+            self._rows.append(message)
+
+    def subscribe(self, link: BusClient, source: Source, name: str | None = None) -> None:
+        """Subscribe to the messages of a sender, or of all by default, with those that are cached."""
+        key = keys.build(link.fleet, source.role, source.topic, name)
+        link.subscribe(key, source.message, self.add if source.numbered else self.add_unnumbered, history=True)
+
     def abandon(self, gap: Gap, reason: str) -> None:
         """Fetch a gap no more: it becomes a row."""
         if gap in self.missing:
@@ -193,7 +205,7 @@ class Recorder:
             status=status,
             fleet=self.fleet,
             parts=self.parts + bool(self._rows),
-            senders={name: count for name, count in sorted(self.counts.items()) if count.kept},
+            senders={name: count for name, count in self.counts.items() if count.kept},
             missing=tuple(self.missing),
             rows={kind: self._written.get(kind, 0) + len(rows[kind]) for kind in KINDS},
             cell=self.cell,
@@ -227,6 +239,18 @@ class Recorder:
         count.kept += 1
         count.last = number
         count.time_s = time_s if begins or restarted else max(count.time_s, time_s)
+        return True
+
+    def _take_unnumbered(self, operation: Operation) -> bool:
+        """Count an operation of an arm; return whether it is new."""
+        count = self.counts.setdefault(f"operations of {operation.auctioneer}", SenderCount())
+        request = operation.time_s, operation.request.request
+        if request in count.requests:
+            count.twice += 1
+            return False
+        count.kept += 1
+        count.time_s = max(count.time_s, operation.time_s)
+        count.requests = (*count.requests, request)[-HISTORY:]
         return True
 
     def _fill(self, series: Series, count: SenderCount, time_s: float) -> bool:
@@ -312,16 +336,17 @@ class GapFetcher:
         """Return the senders of the next sweep: those of results and operations, which are few, first.
 
         Of an auctioneer that is known by its results the only operation may be what is missing, of an arm that is known
-        by its states the only event, and of an auctioneer that is not known, "*", all.
+        by its states the only event or operation, and of an auctioneer that is not known, "*", all.
         """
         known = sorted({name.partition(", epoch")[0] for name in self._recorder.counts} - {""}, reverse=True)
-        auctioneers = {name.partition(" of ")[2] for name in known if name.startswith(("results", "operations"))}
-        both = [f"{kind} of {name}" for kind in ("results", "operations") for name in sorted(auctioneers) or ["*"]]
-        central = both[:SWEEP_KEYS]
         of_arms = (name.partition(" of ")[2] for name in known if name.startswith(("events", "telemetry")))
-        arms = [f"events of {name}" for name in dict.fromkeys(of_arms)]
+        arms = list(dict.fromkeys(of_arms))
+        central = {name.partition(" of ")[2] for name in known if name.startswith(("results", "operations"))}
+        auctioneers = sorted(central.difference(arms)) or ["*"]
+        both = [f"{kind} of {name}" for kind in ("results", "operations") for name in auctioneers]
         start, self._swept = self._swept % max(1, len(arms)), self._swept + SWEEP_KEYS
-        return (*central, *dict.fromkeys((arms[start:] + arms)[:SWEEP_KEYS]))
+        turn = dict.fromkeys((arms[start:] + arms)[:SWEEP_KEYS])
+        return (*both[:SWEEP_KEYS], *(f"{kind} of {name}" for name in turn for kind in ("events", "operations")))
 
     def _begin(self, senders: tuple[str, ...]) -> None:
         link = self._connect()
@@ -332,9 +357,8 @@ class GapFetcher:
         self._link, self._asked = link, senders
         for sender in senders:
             kind, _, name = sender.partition(" of ")
-            source = SOURCES[cast(Kind, kind)]
-            key = keys.build(link.fleet, source.role, source.topic, None if name == "*" else name)
-            link.subscribe(key, source.message, self._recorder.add, history=True)
+            for source in (each for each in SOURCES if each.kind == kind):
+                self._recorder.subscribe(link, source, None if name == "*" else name)
 
     def _count(self) -> None:
         """Abandon the gaps of senders after `ATTEMPTS` requests."""
@@ -363,8 +387,8 @@ class RecorderNode:
         self._fetcher = GapFetcher(recorder, connect)
         self._due_s, self._failure = time.monotonic() + rotate_s, ""
         self._ask_cell_s = -math.inf
-        for role, topic, kind in SOURCES.values():
-            link.subscribe(keys.of_every(link.fleet, role, topic), kind, recorder.add, history=True)
+        for source in SOURCES:
+            recorder.subscribe(link, source)
 
     def serve(self, until_s: float = math.inf) -> None:
         """Handle messages for a turn, and do what is due; after a disk error they are tried again later."""

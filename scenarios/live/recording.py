@@ -9,7 +9,7 @@ import io
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from heapq import merge
 from pathlib import Path
@@ -36,21 +36,26 @@ Kind = Literal["telemetry", "events", "results", "operations", "alarms", "gaps"]
 
 
 class Source(NamedTuple):
-    """The key that messages of a kind have, and their type."""
+    """A key of messages of a kind, and their type."""
 
+    kind: Kind
     role: keys.Role
     topic: str
     message: type[Message]
+    numbered: bool = True
+    """Whether each sender numbers them."""
 
 
-SOURCES: Mapping[Kind, Source] = {
-    "telemetry": Source("arm", "state", State),
-    "events": Source("arm", "event", ArmEvent),
-    "results": Source("auction", "result", Result),
-    "operations": Source("auction", "operation", Operation),
-    "alarms": Source("monitor", "alarm", Alarm),
-}
-KINDS: tuple[Kind, ...] = (*SOURCES, "gaps")
+SOURCES = (
+    Source("telemetry", "arm", "state", State),
+    Source("events", "arm", "event", ArmEvent),
+    Source("results", "auction", "result", Result),
+    Source("operations", "auction", "operation", Operation),
+    Source("operations", "arm", "operation", Operation, numbered=False),  # without an auctioneer
+    Source("alarms", "monitor", "alarm", Alarm),
+)
+MESSAGE_KINDS: tuple[Kind, ...] = tuple(dict.fromkeys(source.kind for source in SOURCES))
+KINDS: tuple[Kind, ...] = (*MESSAGE_KINDS, "gaps")
 RECORDING_FORMAT = 7
 CARD = "recording.json"
 SENSORS = ("q", "qd", "tau", "current_a", "temp_c", "housing_c", "expected_c")
@@ -95,6 +100,9 @@ class SenderCount:
     time_s: float = -math.inf
     """Latest fleet time of a message since the last start of the sender."""
     epochs: tuple[str, ...] = ()
+    """In the order of their first messages."""
+    requests: tuple[tuple[float, str], ...] = ()
+    """Fleet time and name of the last operations, if the sender does not number them."""
 
 
 class RecordingCard(msgspec.Struct, frozen=True):
@@ -106,6 +114,7 @@ class RecordingCard(msgspec.Struct, frozen=True):
     parts: int
     """Number of the last complete part."""
     senders: dict[str, SenderCount]
+    """In the order of their first messages; an auctioneer counts as another sender in each epoch."""
     missing: tuple[Gap, ...] = ()
     """Messages that are still being fetched."""
     rows: dict[Kind, int] = {}
@@ -276,7 +285,7 @@ def open_messages(folder: Path) -> RecordedMessages:
         FleetError: it is neither, or a damaged run.
     """
     if (folder / CARD).exists():
-        return RecordedMessages(read_card(folder).fleet, *(read_parts(folder, kind) for kind in SOURCES))
+        return RecordedMessages(read_card(folder).fleet, *(read_parts(folder, kind) for kind in MESSAGE_KINDS))
     if not (folder / "run.json").exists():
         raise FleetError(f"'{folder}' is neither the folder of a run (run.json) nor a recording of the bus ({CARD}).")
     from scenarios.run.log import OF_EVENTS, open_run, record_table  # loads the environment: no part of a recorder
@@ -359,12 +368,13 @@ def replay(messages: RecordedMessages, link: BusClient, *, speed: float, stopped
             link.serve(min(due_s, time.monotonic() + TURN_S))
         if stopped():
             break
-        source = next(source for source in SOURCES.values() if isinstance(message, source.message))
         match message:
             case Result(auctioneer=sender) | Operation(auctioneer=sender) | Alarm(monitor=sender):
                 pass
             case State(arm=sender) | ArmEvent(arm=sender):
                 pass
+        sources = [source for source in SOURCES if isinstance(message, source.message)]
+        source = next((each for each in sources if (each.role == "arm") == (sender in arms)), sources[0])
         key = str(keys.ParsedKey(link.fleet, source.role, sender, source.topic))
         if key not in publishers:
             publishers[key] = link.publisher(key, source.message)

@@ -10,6 +10,7 @@ from collections import Counter, defaultdict, deque
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any  # values of a card
 
@@ -21,7 +22,7 @@ import pyarrow.compute as pc
 from fleet.arm.cell import cell_model
 from fleet.bus.protocol.auction import ArmOffer, PlanQuote
 from fleet.bus.protocol.cell import Cell
-from fleet.bus.protocol.operator import ALL_ARMS, Alarm
+from fleet.bus.protocol.operator import ALL_ARMS, Alarm, by_whom
 from fleet.errors import FleetError
 from fleet.events import EVENT_KINDS, Event
 from fleet.heat.effects import arrhenius_rate, life_used, most_drift_m, segment_temperatures
@@ -29,17 +30,22 @@ from fleet.live.job_rules import EXPIRED
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
 from scenarios.live.cell import described_model
-from scenarios.live.recording import Kind, alarms_of, lost_rows, read_card, read_parts
+from scenarios.live.recording import Kind, SenderCount, alarms_of, lost_rows, read_card, read_parts
 from scenarios.run.log import UNITS, joint_values
 from scenarios.run.records import SAME_MOMENT_DIGITS, Halt, JobRecord, Notice, Offer, ShiftLog
 from scenarios.show.run_page import report_html
-from scenarios.show.words import clock
+from scenarios.show.words import clock, names_text
 from scenarios.spec.schema import Scenario
 
 MOST_SAMPLES = 20_000
 """Samples of telemetry in a report, in time."""
 ABSENT_SAMPLES = 30
 """Without a state for this many typical intervals, an arm has no temperature in the report."""
+TELEMETRY = "telemetry of "
+"""Before the name of an arm, its states in the card."""
+RESTARTED, ABSENT = "the arm was restarted", "no later state of the arm is recorded"
+UNKNOWN_RETURN = "the reason is not recorded"
+"""Why an arm has a job no more."""
 _ENDED = ("waiting", "given_up", "unfinished", "cancelled")
 """States of a job in which the arm that had it has it no more."""
 
@@ -67,17 +73,25 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
         FleetError: it is no recording, has no states of arms yet, or has arms that the scenario does not have.
     """
     card = read_card(folder)
-    epochs = dict.fromkeys(epoch for count in card.senders.values() for epoch in count.epochs)
+    epochs = epochs_of(card.senders)
     kinds: tuple[Kind, ...] = ("telemetry", "events", "results", "operations")
-    table, log, results, operations = (_of_epoch(read_parts(folder, kind), [*epochs]) for kind in kinds)
+    table, log, results, operations = (_of_epoch(read_parts(folder, kind), epochs) for kind in kinds)
     arms = tuple(sorted(set(table["arm"].to_pylist())))
     if not arms:
-        raise FleetError(f"'{folder}' holds no state of an arm yet; record longer.")
+        which = f" of the epoch {epochs[-1]}" if epochs else ""
+        raise FleetError(f"'{folder}' holds no state of an arm{which} yet; record longer.")
     limits, model = _cell(scenario, card.cell, arms)
     alarms = alarms_of(folder) if len(epochs) < 2 else []  # they name no epoch
-    ordered = order_events(arm_events(log), _returns(results))
-    jobs = tuple(job_records(results))
-    due_s = {job.job: job.due_s for job in jobs}  # as last changed; an arm knows the date of its award
+    if len(epochs) > 1:
+        operations = operations.filter(pc.field("epoch") != "")
+    reported, telemetry, pauses = arm_events(log), telemetry_of(table, arms), tuple(_pauses(operations))
+    work = [] if results.num_rows else work_in_states(table, _absent_s(telemetry))
+    ordered = order_events(reported, (*_returns(results), *returns_in_states(work, reported, pauses, operations)))
+    published = tuple(job_records(results))
+    ended = {job.job for job in published} | {event.job for event in reported if event.kind == "finish"}
+    jobs = (*published, *steered_jobs(operations, ended))
+    # As last changed; an arm knows the date of its award.
+    due_s = changed_due_s(operations) | {job.job: job.due_s for job in published}
     events = tuple(
         replace(event, value=max(0.0, event.time_s - due_s[event.job]))
         if event.kind == "finish" and event.job in due_s
@@ -85,22 +99,17 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
         for event in ordered
         if event.arm in arms
     )
-    telemetry = telemetry_of(table, arms)
     shown = {
         "status": "running" if card.status == "recording" else card.status,
         "scenario": {"name": card.fleet},
         "policy": "live recording",
         "metrics": _metrics(telemetry, events, jobs, arms, limits.warning_c) | heat_use(table, arms),
         "messages": {
-            sender: f"{count.kept} recorded, {count.missed} missing" for sender, count in card.senders.items()
+            sender: f"{count.kept} recorded, {count.missed} missing" for sender, count in sorted(card.senders.items())
         },
         "missing": _missing(read_parts(folder, "gaps"), lost_rows(folder)),
         "jobs submitted by": _submitters(results),
     }
-    if len(epochs) > 1:
-        shown["epochs"] = (
-            f"{len(epochs)} are recorded here; this page shows the last one, {[*epochs][-1]}, without alarms"
-        )
     return RecordingLog(
         card=shown,
         arms=arms,
@@ -109,11 +118,46 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
         events=events,
         jobs=jobs,
         notices=(*map(_request_notice, operations.to_pylist()), *_alarm_notices(alarms, arms, jobs)),
-        halts=tuple(_halts(alarms, operations, results["time_s"].to_pylist(), arms)),
+        halts=(*_silences(alarms, results["time_s"].to_pylist(), arms), *pauses),
         ended_s=min((row["time_s"] for row in results.to_pylist() if row["shift_ended"]), default=math.inf),
         offers=tuple(offer for row in results.to_pylist() for offer in offers_of(row)),
+        remarks=tuple(_left_out(epochs, card.senders)),
         model=model,
     )
+
+
+def epochs_of(senders: Mapping[str, SenderCount]) -> tuple[str, ...]:
+    """Epochs of the fleet in the order in which they began, as those who allocate jobs published them.
+
+    Without an auctioneer they are those of most arms; so is one in which an auctioneer has published nothing yet. One
+    arm alone may publish a wrong one.
+    """
+    central = [count for name, count in senders.items() if name.startswith(("results of ", "operations of "))]
+    allocated = tuple(dict.fromkeys(epoch for count in central for epoch in count.epochs))
+    own = [count.epochs for name, count in senders.items() if name.startswith(TELEMETRY) and count.epochs]
+    if not own:
+        return allocated
+    arms, last = Counter(epoch for epochs in own for epoch in epochs), Counter(epochs[-1] for epochs in own)
+    newest = max(last, key=lambda epoch: (last[epoch], arms[epoch]))
+    if not allocated:
+        return (*(epoch for epoch, count in arms.items() if epoch != newest and 2 * count > len(own)), newest)
+    begun = newest not in allocated and last[newest] > max(1.0, len(own) / 2)
+    return (*allocated, newest) if begun else allocated
+
+
+def _left_out(epochs: Sequence[str], senders: Mapping[str, SenderCount]) -> Iterator[str]:
+    """What the report leaves out, in sentences."""
+    if len(epochs) > 1:
+        which = f"{len(epochs)} epochs are recorded; this page shows the last one, {epochs[-1]}"
+        yield f"{which}, without alarms and requests that name no epoch."
+    others = {
+        name.removeprefix(TELEMETRY): other
+        for name, count in sorted(senders.items())
+        if name.startswith(TELEMETRY) and (other := [epoch for epoch in count.epochs if epoch not in epochs])
+    }
+    if others:
+        names = names_text([*dict.fromkeys(epoch for other in others.values() for epoch in other)])
+        yield f"{names_text([*others])} published states of another epoch, {names}: this page leaves them out."
 
 
 def _cell(
@@ -141,11 +185,11 @@ def order_events(events: Iterable[Event], returns: Iterable[Event]) -> list[Even
     """Events of arms that contradict each other nowhere, by arm and time.
 
     An award to a busy arm begins when the arm is free. A job that the arm neither finished nor lost by a fault ends
-    with a `return`: where the auctioneer took it back, or where the arm went on with another one.
+    with a `return`: a recorded one, or at the award of the job that the arm finished next.
 
     Args:
         events: As the arms reported them, in any order; some may be missing.
-        returns: A `return` for every job that the auctioneer took back from its arm.
+        returns: A `return` for every job that an arm had and has no more, as far as it is recorded.
     """
     own: dict[str, list[Event]] = defaultdict(list)
     for event in (*events, *returns):
@@ -196,7 +240,7 @@ def _order_of_arm(log: list[Event]) -> list[Event]:
                         begin(event.time_s)
             case "finish":
                 while event.job != job and event.job in waiting and job:
-                    end(replace(event, value=float("nan"), reason="the arm went on with another job"))
+                    end(replace(event, time_s=queue[0].time_s, value=math.nan, reason=UNKNOWN_RETURN))
                 if event.job == job and not finished:
                     emit(event)
                     finished = True
@@ -274,6 +318,140 @@ def _returns(results: pa.Table) -> list[Event]:
     return out
 
 
+@dataclass(frozen=True)
+class Work:
+    """A job of an arm by its states: from the first one that names the job to the last one in a row."""
+
+    arm: str
+    job: str
+    begin_s: float
+    last_s: float
+    end_s: float
+    """Time of the next state, or of the last one of an absent arm."""
+    lost: str
+    """Why the arm lost it: it was restarted, or is absent; "" if it had it to the end."""
+
+
+def _absent_s(telemetry: Telemetry) -> float:
+    """Time after which an arm without a state is absent at the end."""
+    step_s = telemetry.time_s[1] - telemetry.time_s[0] if len(telemetry.time_s) > 1 else 0.0
+    return float(telemetry.time_s[-1] - ABSENT_SAMPLES * step_s)
+
+
+def work_in_states(table: pa.Table, absent_s: float) -> list[Work]:
+    """The jobs of the arms by their states, without those that they still have, in order of arm and time.
+
+    Args:
+        absent_s: An arm without a state after this time is absent.
+    """
+    states: dict[str, list[tuple[float, int, str]]] = defaultdict(list)
+    columns = (table[name].to_pylist() for name in ("arm", "time_s", "tick", "job"))
+    for arm, time_s, tick, job in zip(*columns, strict=True):
+        states[arm].append((time_s, tick, job))
+    out: list[Work] = []
+    for arm, own in sorted(states.items()):
+        begin_s = own[0][0]
+        for (time_s, tick, job), (next_s, next_tick, next_job) in pairwise(own):
+            lost = RESTARTED if next_tick <= tick else ""
+            if next_job != job or lost:
+                out += [Work(arm, job, begin_s, time_s, next_s, lost)] if job else []
+                begin_s = next_s
+        last_s, _, job = own[-1]
+        if job and last_s < absent_s:
+            out.append(Work(arm, job, begin_s, last_s, last_s, ABSENT))
+    return out
+
+
+def returns_in_states(
+    work: Iterable[Work], events: Iterable[Event], pauses: Sequence[Halt], operations: pa.Table
+) -> list[Event]:
+    """A `return` for each job that an arm had by its states and has no more, though it reported no end of it.
+
+    Without an auctioneer nobody publishes why an arm returns a job. The reason is what was recorded: a restart,
+    a request of a person, or a break.
+
+    Args:
+        pauses: Of arms, by people.
+    """
+    ends_s: dict[tuple[str, str], list[float]] = defaultdict(list)
+    breaks: dict[str, list[Event]] = defaultdict(list)
+    for event in events:
+        if event.kind in ("finish", "fault", "return"):
+            ends_s[event.arm, event.job].append(event.time_s)
+        elif event.kind in ("break", "break_end"):
+            breaks[event.arm].append(event)
+    requests = operations.to_pylist()
+    out: list[Event] = []
+    for each in work:
+        if not any(each.begin_s <= time_s <= each.end_s for time_s in ends_s[each.arm, each.job]):
+            time_s = each.last_s if each.lost else each.end_s
+            reason = each.lost or _reason_to_return(each, breaks[each.arm], pauses, requests)
+            out.append(Event(time_s=time_s, kind="return", arm=each.arm, job=each.job, reason=reason))
+    return out
+
+
+def _reason_to_return(
+    work: Work, breaks: Iterable[Event], pauses: Iterable[Halt], requests: Iterable[Mapping[str, Any]]
+) -> str:
+    """Why an arm returned a job, as far as it was recorded.
+
+    Args:
+        breaks: Begins and ends of the breaks of the arm.
+    """
+    for row in requests:
+        if row["note"] or not work.begin_s <= row["time_s"] <= work.end_s:
+            continue
+        if row["action"] == "cancel" and row["job"] == work.job:
+            return f"it was cancelled{by_whom(row['by'])}"
+        if row["action"] == "clear" and row["arm"] == work.arm:
+            return f"the space of {work.arm} was cleared{by_whom(row['by'])}"
+    for pause in pauses:
+        if pause.arm in ("", work.arm) and pause.start_s <= work.end_s and pause.end_s > work.begin_s:
+            return pause.reason
+    last = max((each for each in breaks if each.time_s <= work.end_s), key=lambda each: each.time_s, default=None)
+    return UNKNOWN_RETURN if last is None or last.kind == "break_end" else f"a break, '{last.reason}'"
+
+
+def steered_jobs(operations: pa.Table, known: Container[str]) -> Iterator[JobRecord]:
+    """Jobs that people cancelled or settled, where no auctioneer publishes the states of jobs.
+
+    Args:
+        known: Jobs whose states or ends were published.
+    """
+    ends: dict[str, tuple[str, float | None]] = {}
+    for row in operations.to_pylist():
+        job, outcome = row["job"], json.loads(row["content"])["action"].get("outcome")
+        if row["note"] or job in known:
+            continue
+        if row["action"] == "cancel":
+            ends[job] = "cancelled", None
+        elif outcome == "done":
+            ends[job] = "finished", row["time_s"]
+        elif outcome == "redo":
+            ends[job] = "waiting", None
+    for job, (state, finished_s) in ends.items():
+        yield JobRecord(
+            job=job,
+            state=state,
+            release_s=math.nan,
+            due_s=math.nan,
+            finished_s=finished_s,
+            value=math.nan,
+            payload_kg=0.0,
+            cycles=0,
+        )
+
+
+def changed_due_s(operations: pa.Table) -> dict[str, float]:
+    """Due dates that people have set, by job; infinite for none."""
+    due_s: dict[str, float] = {}
+    for row in operations.to_pylist():
+        action = json.loads(row["content"])["action"]
+        if "due_s" in action and not row["note"]:
+            due_s[row["job"]] = math.inf if action["due_s"] is None else action["due_s"]
+    return due_s
+
+
 def telemetry_of(table: pa.Table, arms: Sequence[str]) -> Telemetry:
     """Telemetry of a recording on common times: at each, the last reading of every arm, or NaN if it was absent."""
     all_s = table["time_s"].to_numpy()
@@ -320,13 +498,15 @@ def _metrics(
     telemetry: Telemetry, events: Sequence[Event], jobs: Sequence[JobRecord], arms: Sequence[str], warning_c: float
 ) -> dict[str, Any]:
     """Key figures, named as in a run; what only the simulator knows is left out."""
-    late_s = [event.value for event in events if event.kind == "finish"]
+    late_by_job = {job.job: job.finished_s - job.due_s for job in jobs if job.finished_s is not None}
+    late_by_job |= {event.job: event.value for event in events if event.kind == "finish"}
+    late_s = [each if math.isnan(each) else max(0.0, each) for each in late_by_job.values()]
     states = Counter(job.state for job in jobs)
     names = {job.job for job in jobs} | {event.job for event in events if event.job}
     step_s = float(telemetry.time_s[1] - telemetry.time_s[0]) if len(telemetry.time_s) > 1 else 0.0
     span_h = float(telemetry.time_s[-1] - telemetry.time_s[0]) / 3600.0
     seen = np.asarray(np.isfinite(telemetry.temp_c).any(axis=2))
-    finished = max(len(late_s), states["finished"])
+    finished = len(late_by_job.keys() | {job.job for job in jobs if job.state == "finished"})
     hot = (np.nan_to_num(telemetry.temp_c, nan=-np.inf) > warning_c).any(axis=2)
     peaks = {arm: float(np.nanmax(telemetry.temp_c[:, a])) for a, arm in enumerate(arms) if seen[:, a].any()}
     return {
@@ -375,9 +555,9 @@ def _missing(gaps: pa.Table, lost: Mapping[Kind, int]) -> Mapping[str, str]:
     return missing or {"": "none"}
 
 
-def _of_epoch(table: pa.Table, epochs: list[str]) -> pa.Table:
-    """Rows of the last of several epochs, each of which begins its time again."""
-    if len(epochs) < 2:
+def _of_epoch(table: pa.Table, epochs: Sequence[str]) -> pa.Table:
+    """Rows of the last epoch, each of which begins its time again."""
+    if not epochs:
         return table
     return table.filter(pc.field("epoch").isin(["", epochs[-1]]))  # "": before an arm knew it
 
@@ -421,10 +601,8 @@ def _alarm_notices(alarms: Sequence[Alarm], arms: Sequence[str], jobs: Sequence[
                 yield Notice(time_s=time_s, kind=kind, arm=arm, job=job, reason=reason)
 
 
-def _halts(
-    alarms: Sequence[Alarm], operations: pa.Table, results_s: Sequence[float], arms: Container[str]
-) -> Iterator[Halt]:
-    """When nobody replied about the jobs or awarded them, and when arms were paused.
+def _silences(alarms: Sequence[Alarm], results_s: Sequence[float], arms: Container[str]) -> Iterator[Halt]:
+    """When nobody replied about the jobs or awarded them.
 
     Args:
         results_s: Times of the results, ascending: the next one ends an alarm whose gateway has exited.
@@ -435,6 +613,10 @@ def _halts(
         reason = f"{alarm.subject} {kinds[alarm.kind]}" if alarm.subject else "nobody replied"
         one = alarm.subject if alarm.kind == "stopped" and alarm.subject in arms else ""  # it allocates with its peers
         yield Halt(arm=one, start_s=alarm.began_s, end_s=end_s, reason=reason)
+
+
+def _pauses(operations: pa.Table) -> Iterator[Halt]:
+    """When people had paused arms."""
     paused: dict[str, Halt] = {}
     for row in operations.to_pylist():
         arm = "" if row["arm"] == ALL_ARMS else row["arm"]

@@ -240,10 +240,11 @@ class JobRecord:
     release_s: float
     """NaN if it was not recorded."""
     due_s: float
-    """Infinite without a due date."""
+    """Infinite without a due date, NaN if it was not recorded."""
     finished_s: float | None
     """None if it was not finished."""
     value: float
+    """NaN if it was not recorded."""
     payload_kg: float
     cycles: int
 
@@ -320,6 +321,8 @@ class ShiftLog:
     halts: tuple[Halt, ...] = ()
     ended_s: float = inf
     """End of the shift, if it was before the last reading."""
+    remarks: tuple[str, ...] = ()
+    """What its records leave out, in sentences."""
 
     @cached_property
     def begin(self) -> datetime | None:

@@ -52,7 +52,7 @@ def verdict(log: ShiftLog) -> Verdict:
     contacts = sum(event.kind == "contact" for event in log.events)
     about = {_fault(fault, log): fault for fault in faults[:MOST_FAULTS]}
     moments = {sentence: _before(fault) for sentence, fault in about.items()}
-    sentences = [*_jobs(metrics), *_outside_shift(log.card.get("scenario") or {})]
+    sentences = [*log.remarks, *_jobs(metrics), *_outside_shift(log.card.get("scenario") or {})]
     for sentence, fault in about.items():
         sentences += [sentence, *_cause(fault, log)]
     if len(faults) > MOST_FAULTS:
@@ -390,6 +390,7 @@ NOTABLE = (
     "cancel",
     "settle",
     "change",
+    "clear",
     "recover",
     "return",
     "break",

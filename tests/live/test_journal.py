@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from benchmarks.simulation.disk import Crash, Disk, SimulatedConnection, SqliteFiles
 from fleet.bus.protocol.auction import Award, JobSpec, Report
+from fleet.bus.protocol.consensus import JobOutcome
 from fleet.bus.protocol.messages import encode
 from fleet.errors import JournalError, JournalFull
 from fleet.live import journal
@@ -26,8 +27,9 @@ from fleet.live.auction.node import AuctionNode
 from fleet.live.book import JobBook
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
-from fleet.live.journal import CommitPermitted, CompactingJournal, Journal, Started, TimeRecorder
-from fleet.live.records import BookRecord
+from fleet.live.epochs import describe, history_of
+from fleet.live.journal import CommitPermitted, CompactingJournal, JobsAccepted, Journal, Started, TimeRecorder
+from fleet.live.records import BookRecord, JobSettled
 from scenarios.live.arm import restart_history
 from tests.live.test_poison import Arm, Wire
 from tests.profiles import examples
@@ -322,6 +324,19 @@ def test_a_history_of_long_names_fits_into_one_message():
     assert 0 < len(message.finished) < 256
     assert message.finished[-1] == jobs[-1]
     assert len(encode(message)) < 65_536
+
+
+def test_the_history_of_an_arm_without_an_auctioneer_has_the_jobs_that_finished_last():
+    """In that order, whatever their releases and names are."""
+    jobs = tuple(JobSpec(name=f"{number:0128d}", kind="hold", places=("p" * 128,)) for number in range(250))
+    book = JobBook(name="a", is_central=False).replay([JobsAccepted(jobs, "test", 0.0)])
+    for time_s, job in enumerate(reversed(jobs)):
+        book.apply(JobSettled(JobOutcome(job.name, "award", "a", "finished", 1, float(time_s))))
+    message = history_of("a", book)
+    assert 0 < len(message.finished) < 250
+    assert message.finished == jobs[len(message.finished) - 1 :: -1]
+    last = ", ".join(job.name for job in jobs[4::-1])
+    assert f"{len(message.finished)} finished job(s), the last ones {last}, and" in describe(message)
 
 
 KINDS = {"arm": ArmRecord, "arm without auctioneer": BookRecord, "auctioneer": BookRecord}

@@ -23,7 +23,17 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
 from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import Alarm, Cancel, Change, ControlRequest, Operation, Pause, Resume, Settle
+from fleet.bus.protocol.operator import (
+    Alarm,
+    Cancel,
+    Change,
+    Clear,
+    ControlRequest,
+    Operation,
+    Pause,
+    Resume,
+    Settle,
+)
 from fleet.bus.router import Router
 from fleet.errors import FleetError
 from fleet.events import Event
@@ -31,8 +41,8 @@ from fleet.live.job_rules import EXPIRED
 from fleet.robot import ThermalLimits
 from scenarios.cli.main import main
 from scenarios.live.recorder import SWEEP_S, GapFetcher, Recorder, record
-from scenarios.live.recording import CARD, alarms_of, open_messages, read_card, read_parts, replay
-from scenarios.live.recording_report import heat_use, open_recording, order_events
+from scenarios.live.recording import CARD, SOURCES, alarms_of, open_messages, read_card, read_parts, replay
+from scenarios.live.recording_report import epochs_of, heat_use, open_recording, order_events
 from scenarios.result_folder import lock_folder
 from scenarios.run.records import JobRecord, ShiftLog, schedule
 from scenarios.show.run_page import late_jobs, lateness_text, report_html, verdict
@@ -108,8 +118,31 @@ def test_events_are_sought_of_an_arm_that_is_known_by_its_states_alone(tmp_path)
     recorder.add("a", state("a", 1))
     link = MagicMock(fleet="f", subscribe=lambda key, *_, **__: asked.append(key))
     GapFetcher(recorder, lambda: link).step(time.monotonic() + SWEEP_S)
-    of_auctioneers = [keys.of_every("f", "auction", topic) for topic in ("result", "operation")]
-    assert asked == [*of_auctioneers, keys.of_arm("f", "a", "event")]
+    unknown = [keys.of_every("f", *each) for each in (("auction", "result"), ("auction", "operation"))]
+    assert asked[:3] == [*unknown, keys.of_every("f", "arm", "operation")]
+    assert [key for key in asked[3:] if "/arm/" in key] == [
+        keys.of_arm("f", "a", each) for each in ("event", "operation")
+    ]
+
+
+def test_the_requests_that_arms_publish_without_an_auctioneer_are_kept_once(tmp_path):
+    """They have no number: caches repeat them after a later one, and after a restart of the recorder."""
+    sent = [
+        Operation(arm, time_s, ControlRequest(name, Pause(), "ann"))
+        for arm, time_s, name in (("a", 5.0, "1"), ("a", 5.0, "2"), ("b", 4.0, "1"), ("a", 9.0, "3"))
+    ]
+    link = MagicMock(fleet="f")
+    for _ in range(2):
+        recorder = Recorder.open(tmp_path, "f")
+        for source in SOURCES:
+            recorder.subscribe(link, source)
+        handle = next(call.args[2] for call in link.subscribe.mock_calls if call.args[0].endswith("/arm/*/operation"))
+        for operation in (*sent, *sent[:2]):
+            handle(operation.auctioneer, operation)
+        recorder.write()
+    assert sorted(map(repr, open_messages(tmp_path))) == sorted(map(repr, sent))
+    count = recorder.counts["operations of a"]
+    assert (count.kept, count.missed, recorder.missing) == (3, 0, [])
 
 
 def test_messages_of_a_restarted_arm_are_kept(tmp_path):
@@ -285,6 +318,21 @@ def test_a_replay_publishes_the_same_messages_and_refuses_names_of_present_arms(
             replay(messages, other, speed=100.0, stopped=lambda: False)
     for kind in ("telemetry", "events", "results"):
         assert read_parts(tmp_path / "second", kind).equals(read_parts(tmp_path / "first", kind)), kind
+
+
+def test_a_replay_publishes_a_request_under_the_key_of_its_arm_or_auctioneer(tmp_path):
+    recorder = Recorder.open(tmp_path, "f")
+    recorder.add("a", state("a", 1))
+    recorder.add("boss", operation(1))
+    recorder.add_unnumbered("a", Operation("a", 2.0, ControlRequest("pause", Pause(), "ann")))
+    recorder.write()
+    link = MagicMock(fleet="f")
+    link.tokens.return_value = set()
+    assert replay(open_messages(tmp_path), link, speed=100.0, stopped=lambda: False) == 3
+    of_requests = {
+        call.args[0] for call in link.publisher.mock_calls if len(call.args) == 2 and call.args[1] is Operation
+    }
+    assert of_requests == {keys.of_auction("f", "boss", "operation"), keys.of_arm("f", "a", "operation")}
 
 
 def test_two_recorders_cannot_share_a_folder(tmp_path):
@@ -504,16 +552,143 @@ def test_a_returned_job_is_late_by_the_reason_of_its_return(tmp_path):
     assert lateness_text(log, late_jobs(log)).endswith("arm_0 returned it at 0:01:10: its arm was paused by 'ann'.")
 
 
-def test_the_report_of_two_epochs_shows_the_last_one(tmp_path):
+@pytest.mark.parametrize(("first", "last"), [("one", "two"), ("two", "one")])
+def test_the_report_of_two_epochs_shows_the_last_one(tmp_path, first, last):
+    """Whatever their names are, and although the recorder was restarted since."""
     recorder = record_events(tmp_path / "r", ())
-    for epoch, time_s in (("one", 0.0), ("two", 5.0)):
-        for number, job in enumerate(("x", "y") if epoch == "one" else ("z",)):
+    for epoch, time_s in ((first, 5.0), (last, 0.0)):
+        for number, job in enumerate(("x", "y") if epoch == first else ("z",)):
             status = JobStatus(job, "finished", arm="arm_0")
             recorder.add("boss", Result("boss", number, time_s, status, epoch=epoch))
+        recorder.write()
+        recorder = Recorder.open(tmp_path / "r", "shop")
     recorder.write(status="finished")
     html = open_recording(tmp_path / "r").page()
-    assert "this page shows the last one, two" in html
+    assert f"2 epochs are recorded; this page shows the last one, {last}, without alarms" in html
     assert "<dt>jobs finished</dt><dd>1 of 1</dd>" in html
+
+
+def test_an_epoch_without_a_result_has_begun_when_most_arms_have_it(tmp_path):
+    """After a lost journal an auctioneer publishes nothing before the first job."""
+    recorder = record_events(tmp_path / "r", ())
+    status = JobStatus("x", "finished", arm="arm_0")
+    recorder.add("boss", Result("boss", 0, 5.0, status, epoch="two"))
+    for arm, shown in zip(ARMS, ("two", "one"), strict=True):
+        add_states(recorder, arm, [""] * 9, epoch="one", first_s=200.0)
+        recorder.write()
+        assert epochs_of(read_card(tmp_path / "r").senders)[-1] == shown
+    log = open_recording(tmp_path / "r")
+    assert log.remarks[0].startswith("2 epochs are recorded; this page shows the last one, one,")
+    assert log.card["metrics"]["finished"] == 0
+
+
+def add_states(recorder, arm, jobs, *, epoch="now", first_s=0.0):
+    """A state a second of one start of an arm, with these jobs."""
+    for tick, job in enumerate(jobs):
+        message = State(arm, tick, first_s + tick, "idle", (30.0,) * 7, 30.0, job=job, epoch=epoch)
+        recorder.add(arm, message)
+
+
+@pytest.mark.parametrize("central", [True, False])
+def test_one_arm_with_states_of_another_epoch_does_not_empty_the_report(tmp_path, central):
+    recorder = Recorder.open(tmp_path, "shop")
+    for arm, epoch in (("arm_0", "zzz"), ("arm_1", "now"), ("arm_2", "now")):
+        add_states(recorder, arm, [""] * 50, epoch=epoch)
+    recorder.add("arm_1", ArmEvent("arm_1", 10**9 + 1, 3.0, "award", "x", epoch="now"))
+    recorder.add("arm_1", ArmEvent("arm_1", 10**9 + 2, 9.0, "finish", "x", value=0.0, epoch="now"))
+    if central:
+        recorder.add("boss", Result("boss", 0, 9.0, JobStatus("x", "finished", arm="arm_1"), epoch="now"))
+    recorder.write(status="finished")
+    log = open_recording(tmp_path)
+    assert log.arms == ("arm_1", "arm_2")
+    assert log.card["metrics"]["finished"] == 1
+    assert verdict(log).sentences[0] == "arm_0 published states of another epoch, zzz: this page leaves them out."
+
+
+def test_most_arms_tell_the_last_epoch_without_an_auctioneer(tmp_path):
+    """The names of the epochs and the time since their begin do not; an arm is absent since the first one."""
+    recorder = Recorder.open(tmp_path, "shop")
+    for arm in ("arm_0", "arm_1", "arm_2"):
+        add_states(recorder, arm, [""] * 50, epoch="two", first_s=100.0)
+    for arm in ("arm_1", "arm_2"):
+        add_states(recorder, arm, [""] * 5, epoch="one")
+    recorder.write(status="finished")
+    log = open_recording(tmp_path)
+    assert log.arms == ("arm_1", "arm_2")
+    assert log.remarks == (
+        "2 epochs are recorded; this page shows the last one, one, without alarms and requests that name no epoch.",
+    )
+
+
+def record_peers(folder, jobs, events=(), actions=()):
+    """A log of arms without an auctioneer: states of arm_0 with these jobs, in a list for each of its starts."""
+    recorder = Recorder.open(folder, "shop")
+    begun_s = 0.0
+    for names in jobs:
+        add_states(recorder, "arm_0", names, first_s=begun_s)
+        begun_s += len(names) + 5.0
+    add_states(recorder, "arm_1", [""] * 100)
+    for number, (time_s, kind, job, *reason) in enumerate(events, start=1):
+        fields = {"value": 0.0} if kind in ("award", "finish") else {"reason": "".join(reason)}
+        recorder.add("arm_0", ArmEvent("arm_0", number, time_s, kind, job, epoch="now", **fields))
+    for time_s, action in actions:
+        recorder.add_unnumbered("arm_1", Operation("arm_1", time_s, ControlRequest(str(time_s), action, "ann")))
+    recorder.write(status="finished")
+    return open_recording(folder)
+
+
+NEXT_JOB = [(1.0, "award", "x"), (40.0, "award", "y"), (60.0, "finish", "y"), (62.0, "home", "y")]
+AT_WORK = [""] + ["x"] * 19
+"""States until 20 s."""
+
+
+@pytest.mark.parametrize(
+    ("jobs", "events", "actions", "end_s", "reason"),
+    [
+        ([AT_WORK + [""] * 80], [], [(12.0, Pause()), (35.0, Resume())], 20.0, "all arms were paused by ann"),
+        ([AT_WORK + [""] * 80], [], [(12.0, Cancel("x"))], 20.0, "it was cancelled by 'ann'"),
+        ([AT_WORK + [""] * 80], [(15.0, "break", "", "lunch")], [], 20.0, "a break, 'lunch'"),
+        ([AT_WORK, [""] * 75], [], [], 19.0, "the arm was restarted"),
+        ([AT_WORK], [], [], 19.0, "no later state of the arm is recorded"),
+        ([AT_WORK + [""] * 80], [], [(2.0, Cancel("z")), (30.0, Pause())], 20.0, "the reason is not recorded"),
+    ],
+)
+def test_without_an_auctioneer_a_job_is_returned_when_and_why_the_records_tell(
+    tmp_path, jobs, events, actions, end_s, reason
+):
+    """The arm goes on with another job long after that, if it is there."""
+    later = NEXT_JOB if len(jobs[-1]) > 20 else NEXT_JOB[:1]
+    log = record_peers(tmp_path, jobs, sorted([*later, *events]), actions)
+    (back,) = [event for event in log.events if event.kind == "return"]
+    assert (back.job, back.time_s, back.reason) == ("x", end_s, reason)
+    spans = [(span.job, span.start_s, span.end_s, span.outcome) for span in log.plan.assignments]
+    assert spans == [("x", 1.0, end_s, "returned"), ("y", 40.0, 62.0, "finished")][: len(later)]
+
+
+def test_an_end_that_no_state_shows_is_at_the_next_award_and_its_reason_unknown(tmp_path):
+    log = record_peers(tmp_path, [[""] * 100], NEXT_JOB)
+    assert [(e.time_s, e.reason) for e in log.events if e.kind == "return"] == [(40.0, "the reason is not recorded")]
+
+
+def test_without_an_auctioneer_a_report_has_what_people_requested(tmp_path):
+    """A job that was settled as done is finished, a cancelled one in the report; a changed due date counts."""
+    actions = [
+        (5.0, Change("y", due_s=50.0)),
+        (6.0, Cancel("gone")),
+        (7.0, Pause("arm_0")),
+        (8.0, Clear("arm_2")),
+        (9.0, Settle("x", "done")),
+        (10.0, Cancel("y")),
+        (11.0, Settle("again", "done")),
+        (12.0, Settle("again", "redo")),
+    ]
+    log = record_peers(tmp_path, [AT_WORK + [""] * 80], NEXT_JOB, actions)
+    metrics = log.card["metrics"]
+    assert {job.job: job.state for job in log.jobs} == {"gone": "cancelled", "x": "finished", "again": "waiting"}
+    assert (metrics["jobs"], metrics["finished"], metrics["tardiness_min"]) == (4, 2, 10.0 / 60.0)
+    assert [(late.job, late.late_s) for late in late_jobs(log)] == [("y", 10.0)]
+    kinds = [row[1] for row in listed_events(log.page()) if row[4].endswith(", by ann") or row[4] == "by ann"]
+    assert kinds == ["change", "cancel", "pause", "clear", "settle", "cancel", "settle", "settle"]
 
 
 kinds = st.sampled_from(["award", "finish", "home", "fault", "recover", "return", "warning", "moved"])
