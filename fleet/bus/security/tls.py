@@ -133,6 +133,11 @@ def expires_at(endpoint: str) -> datetime | None:
     return read(tls.folder, tls.file).not_valid_after_utc
 
 
+def has_expired(expires: datetime | None) -> bool:
+    """Whether a certificate that expires then, None for never, is no longer valid."""
+    return expires is not None and datetime.now(UTC) >= expires
+
+
 _NO_REPLY = "the server does not use TLS: no reply to the handshake"
 
 
