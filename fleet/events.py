@@ -50,7 +50,7 @@ MEANINGS: dict[EventKind, Meaning] = {
     "return": Meaning(
         "The job is open again: the arm faulted, or had to return it.", "cycles that are kept", live=True
     ),
-    "give_up": Meaning("Arms faulted in the job too often: it is abandoned."),
+    "give_up": Meaning("Arms faulted in the job too often, or a job before it was given up: it is abandoned."),
     "give_back": Meaning("The arm returned its job after a cycle.", "cycles that are kept"),
     "expire": Meaning("The due date passed before an arm began the job: it is abandoned."),
     "recover": Meaning("The fault is cleared.", live=True),

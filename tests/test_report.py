@@ -509,6 +509,36 @@ def test_late_jobs_turn_the_badge_red_and_abandoned_ones_come_last() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("kind", "told"), [("break", "had a break at 0:03:20"), ("failure", "failed, not by heat, at 0:03:20")]
+)
+def test_a_job_that_came_back_for_a_break_or_a_failure_is_late_by_that(kind: str, told: str) -> None:
+    events = (
+        event(0.0, "release", job="long-1"),
+        event(100.0, "award", job="long-1"),
+        event(200.0, kind, job="", value=400.0),
+        event(250.0, "give_back" if kind == "break" else "return", job="long-1", value=2.0),
+        event(260.0, "home", job="long-1"),
+        *done("long-1", 600, 900, 60.0),
+    )
+    log = replace(log_of(telemetry(1000), ("arm_a", "arm_b"), events), jobs=(record("long-1", 840.0),))
+    assert lateness_text(log, late_jobs(log)) == f"long-1 finished 1 min late: arm_a {told}."
+
+
+def test_a_job_that_is_given_up_with_another_one_says_so() -> None:
+    events = (event(0.0, "release", job="a"), event(300.0, "give_up", "", "a", reason="a job before it was given up"))
+    log = replace(log_of(telemetry(1000), ("arm_a", "arm_b"), events), jobs=(record("a", 500.0, "given_up"),))
+    assert lateness_text(log, late_jobs(log)).endswith(": a job before it was given up.")
+
+
+def test_a_shift_that_ended_with_its_last_job_says_so() -> None:
+    for time_s, count in ((670.0, 1), (7200.0, 0)):
+        card = {"status": "finished", "time_s": time_s, "scenario": {"horizon_s": 7200.0}}
+        told = verdict(log_of(telemetry(670), ("arm_a", "arm_b"), (), card)).sentences
+        early = "The shift of 2 h ended after 11 min 10 s, with its last job: all figures are of that time."
+        assert told.count(early) == count
+
+
 @pytest.mark.parametrize(("at_s", "why"), [(250.0, "place or space taken"), (350.0, "break"), (950.0, "paused")])
 def test_an_offer_names_the_break_or_the_pause_of_its_arm(at_s: float, why: str) -> None:
     events = (event(300.0, "break", job="", value=600.0), event(900.0, "break_end", job=""), *done("a-1", 0.0, 200.0))

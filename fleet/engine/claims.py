@@ -12,7 +12,18 @@ from typing import Any
 import numpy as np
 
 from fleet.engine.state import DONE, EXPIRED, GIVEN_UP, RUNNING, WAITING, State
-from fleet.engine.tables import AWARD, EXPIRE, ILLEGAL, LOST, EventBuffer, Simulation, Tables, record_event
+from fleet.engine.tables import (
+    AWARD,
+    EXPIRE,
+    FOLLOWS,
+    GIVE_UP,
+    ILLEGAL,
+    LOST,
+    EventBuffer,
+    Simulation,
+    Tables,
+    record_event,
+)
 from fleet.jit import jit, jit_inline, nonnegative
 from fleet.telemetry import IDLE, WORKING
 
@@ -68,9 +79,9 @@ def fill_slots(t: Tables, s: State, slot_job: Array, events: EventBuffer, e: int
             break
         if job["expires"] and job["due_s"] < now_s:
             remove_from_queue(s, e, j)
-            give_up(s, e, j, EXPIRED)
             if len(events.what) > 0:
-                record_event(events, EXPIRE, e, -1, j, -1, 0.0, 0.0)
+                record_event(events, EXPIRE, e, -1, j, -1, t.dt_s, 0.0)
+            give_up(s, events, e, j, EXPIRED, t.dt_s)
             place, filled = nonnegative(env["head"]), 0  # jobs in the queue have moved
             continue
         if job["expires"]:
@@ -308,11 +319,12 @@ def return_to_queue(s: State, e: int, j: int, until_s: float) -> None:
 
 
 @jit
-def give_up(s: State, e: int, j: int, why: int) -> None:
+def give_up(s: State, events: EventBuffer, e: int, j: int, why: int, at_s: float) -> None:
     """Give a job up that is not in the queue, and with it all that wait for it.
 
     Args:
         why: Its status from now on, GIVEN_UP or EXPIRED.
+        at_s: When, seconds into the step.
     """
     env, jobs, after = s.env[e], s.jobs[e], s.after[e]
     jobs[j]["status"] = why
@@ -326,6 +338,8 @@ def give_up(s: State, e: int, j: int, why: int) -> None:
                 before = after[i, n]
                 if jobs[i]["status"] == WAITING and before >= 0 and jobs[before]["status"] > DONE:
                     jobs[i]["status"], found = GIVEN_UP, True
+                    if len(events.what) > 0:
+                        record_event(events, GIVE_UP, e, -1, i, -1, at_s, FOLLOWS)
                     remove_from_queue(s, e, i)
                     env["unfinished"] -= 1
                     env["given_up"] += 1

@@ -239,18 +239,22 @@ def _described(
         case event_numbers.RETURN | event_numbers.GIVE_BACK:
             kept = f"{state.cycles[e, j]} of {state.repetitions[e, j]} cycles kept"
             return "return" if kind == event_numbers.RETURN else "give_back", value, kept
+        case event_numbers.GIVE_UP if value == event_numbers.FOLLOWS:
+            return "give_up", math.nan, "a job before it was given up"
         case event_numbers.GIVE_UP:
             return "give_up", value, f"{state.returns[e, j]} faults; {state.cycles[e, j]} cycles done"
         case event_numbers.MOVED:
             return "moved", math.nan, "moved home by a person"
         case event_numbers.EXPIRE:
-            return "expire", math.nan, "its due date passed before an arm began it"
+            return "expire", math.nan, "its due date passed while it waited"
         case event_numbers.FAILURE:
             return "failure", value, f"not by heat; repaired after {value:.0f} s"
         case event_numbers.BREAK:
             return "break", value, f"for {value:.0f} s"
         case event_numbers.BREAK_END:
             return "break_end", math.nan, ""
+        case _ if math.isnan(value):
+            return "recover", math.nan, "repaired"
         case _:
             return "recover", math.nan, f"every motor below {tables.restart_c:g} °C and the fault cleared"
 

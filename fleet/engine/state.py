@@ -55,7 +55,8 @@ ARM = np.dtype(
         ("pending", "?"),
         ("absent", "i1"),
         ("break_tick", "i4"),
-        ("unused", "i1", 4),
+        ("broke", "?"),
+        ("unused", "i1", 3),
     ],
     align=True,
 )
@@ -63,7 +64,8 @@ ARM = np.dtype(
 `State`. `current_sq` and `friction_w` are the heat drive of the present phase of its plan, which ends when `progress_s`
 is `phase_end_s`; `kind` is that of its job, and `pending` whether the job is still to be finished (False on the way
 home). `absent` is the kind of the present absence, 0 for none, and
-`break_tick` when the next break begins, or the present one began."""
+`break_tick` when the next break begins, or the present one began. `broke`: its last fault was a failure, not by
+heat."""
 
 JOB = np.dtype(
     [

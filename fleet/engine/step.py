@@ -411,7 +411,7 @@ def halt(sim: Simulation, e: int, a: int, cut_s: float, at_s: float, by_heat: bo
             job["returns"] += 1
             again = again or before + 1 == MOST_FAULTS
         if again:
-            give_up(s, e, j, GIVEN_UP)
+            give_up(s, events, e, j, GIVEN_UP, at_s)
         else:
             if by_heat:
                 s.failed_arm[e, j, before] = a
@@ -420,6 +420,7 @@ def halt(sim: Simulation, e: int, a: int, cut_s: float, at_s: float, by_heat: bo
         arm["pending"] = False
         if recording:
             record_event(events, GIVE_UP if again else RETURN, e, a, j, -1, at_s, float(kept))
+    arm["broke"] = not by_heat
     arm["mode"], arm["job"], arm["kind"], arm["phase_end_s"] = FAULTED, -1, t.start[env["fleet"], a]["kind"], np.inf
     for k in range(LANES):
         arm["current_sq"][k] = arm["friction_w"][k] = 0.0
@@ -430,7 +431,7 @@ def halt(sim: Simulation, e: int, a: int, cut_s: float, at_s: float, by_heat: bo
 
 @jit
 def recover(sim: Simulation, e: int, a: int, cool_s: float) -> None:
-    """Clear the fault of an arm that has cooled down for long enough, and move it home when that is due.
+    """Clear the fault of an arm that has cooled down for long enough or is repaired; move it home when that is due.
 
     Args:
         cool_s: When every motor is below the restart limit, seconds into the step; inf if not in it.
@@ -451,7 +452,7 @@ def recover(sim: Simulation, e: int, a: int, cool_s: float) -> None:
             arm["moved_at_s"] = np.inf
         env["changed"] = True
         if recording:
-            record_event(events, RECOVER, e, a, -1, -1, recovered_s, t.restart_c)
+            record_event(events, RECOVER, e, a, -1, -1, recovered_s, np.nan if arm["broke"] else t.restart_c)
     if arm["moved_at_s"] <= end_s:
         if recording:
             record_event(events, MOVED, e, a, -1, -1, arm["moved_at_s"] - now_s, 0.0)
@@ -500,6 +501,7 @@ def turn_absences(sim: Simulation, e: int) -> None:
                 if recording:
                     record_event(events, FAILURE, e, a, arm["job"], -1, t.dt_s, left_s)
                 halt(sim, e, a, 0.0, t.dt_s, False)
+                arm["clear_at_s"] = end * t.dt_s
         elif kind == FINISH_CYCLE and arm["mode"] == WORKING and arm["pending"]:
             arm["todo"] = cycles_begun(t.plans, arm)
             set_phase(t.plans, arm)

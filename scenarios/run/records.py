@@ -102,7 +102,7 @@ def schedule(events: Sequence[Event], arms: Sequence[str], horizon_s: float) -> 
     """
     own: dict[str, list[Event]] = {arm: [] for arm in arms}
     for event in events:
-        if event.kind not in _ORDER:
+        if event.kind not in _ORDER or not event.arm:
             continue
         if event.arm not in own:
             raise ValueError(f"No arm '{event.arm}' in this fleet{nearest(event.arm, own)}")

@@ -52,7 +52,7 @@ def verdict(log: ShiftLog) -> Verdict:
     contacts = sum(event.kind == "contact" for event in log.events)
     about = {_fault(fault, log): fault for fault in faults[:MOST_FAULTS]}
     moments = {sentence: _before(fault) for sentence, fault in about.items()}
-    sentences = [*log.remarks, *_jobs(metrics), *_outside_shift(log.card.get("scenario") or {})]
+    sentences = [*log.remarks, *_jobs(metrics), *_early_end(log.card), *_outside_shift(log.card.get("scenario") or {})]
     for sentence, fault in about.items():
         sentences += [sentence, *_cause(fault, log)]
     if len(faults) > MOST_FAULTS:
@@ -96,6 +96,14 @@ def _jobs(metrics: Mapping[str, Any]) -> Iterable[str]:
     if on_time is not None and finished:
         late = ", all on time" if on_time == finished else f", {on_time} of them on time"
     yield f"{finished}{of} jobs finished{late}."
+
+
+def _early_end(card: Mapping[str, Any]) -> Iterable[str]:
+    """That a shift ended with its last job; of recordings, nothing."""
+    time_s, horizon_s = card.get("time_s", math.inf), (card.get("scenario") or {}).get("horizon_s", -math.inf)
+    if card.get("status") == "finished" and time_s < horizon_s:
+        whole = duration(horizon_s)
+        yield f"The shift of {whole} ended after {duration(time_s)}, with its last job: all figures are of that time."
 
 
 def _outside_shift(scenario: Mapping[str, Any]) -> Iterable[str]:
@@ -273,8 +281,15 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
     own = sorted((span for span in log.plan.assignments if span.job == late.job), key=lambda span: span.start_s)
     for span in own:
         if span.outcome in ("returned", "given_up"):
+            absence = next((e for e in log.events if _absence_in(span, e)), None)
+            if absence is not None:
+                what = "had a break" if absence.kind == "break" else "failed, not by heat,"
+                return f"{span.arm} {what} at {clock(absence.time_s, log.begin)}"
             how = f"{span.arm} {'faulted during' if span.faulted else 'returned'} it at {clock(span.end_s, log.begin)}"
             return how if span.faulted else f"{how}{_return_reason(log, span)}"
+    if late.state == "given_up" and not own:
+        why = next((e.reason for e in log.events if e.kind == "give_up" and e.job == late.job), "")
+        return why or "a job before it was given up"
     begin_s = next((job.release_s for job in log.jobs if job.job == late.job), math.nan)
     if math.isnan(begin_s):
         return "its release is not recorded"
@@ -299,6 +314,12 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
     if most:
         return most if most in halts else f"{names_text(able)} {most}"
     return _passed(log, late, able, begin_s, end_s)
+
+
+def _absence_in(span: JobSpan, event: Event) -> bool:
+    """Whether an event is a break or failure of the arm of a span that begins in it."""
+    begins = event.kind in ("break", "failure") and event.arm == span.arm
+    return begins and span.start_s <= event.time_s <= span.end_s
 
 
 def _halt(log: ShiftLog, halt: Halt) -> str:

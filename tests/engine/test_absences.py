@@ -63,6 +63,15 @@ def test_a_failure_stops_an_arm_at_once_and_keeps_whole_cycles(small) -> None:
     assert steps[5].state.mode[0, 0] == FAULTED
 
 
+def test_a_failure_ends_with_its_repair_also_in_an_arm_that_is_too_warm_to_clear_a_fault(small) -> None:
+    """Between restart and warning limit: only a fault by heat waits until it has cooled."""
+    limits = ThermalLimits(warning_c=60.0, error_c=75.0, restart_c=1.0, clear_s=20.0, move_home_s=1e5)
+    log, steps, _ = shift(small, [(0, 5, 9, BROKEN)], [[CLAIM]] * 30, limits=limits)
+    assert [(e.time_s, e.reason) for e in log if e.kind == "recover"] == [(90.0, "repaired")]
+    assert times(log, "finish")
+    assert steps[-1].state.lost_s[0, 0] == pytest.approx(40.0)
+
+
 def test_a_hot_arm_is_repaired_and_cool_before_it_goes_on(small) -> None:
     """Whichever is later; a failure during a fault by heat makes the fault no shorter."""
     limits = ThermalLimits(warning_c=40.0, error_c=45.0, restart_c=38.0, clear_s=20.0)

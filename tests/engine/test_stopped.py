@@ -150,7 +150,9 @@ def test_a_job_expires_at_a_hard_due_date_with_all_that_wait_for_it(small) -> No
     assert open_jobs(world, state)[0][0].tolist() == [0, -1, -1]
     state = step(world, state, np.array([[0]]), plant, log).state
     assert state.status[0].tolist() == [WAITING, EXPIRED, GIVEN_UP, DONE]
-    assert [(e.kind, e.job, e.arm) for e in log if e.kind == "expire"] == [("expire", "hard", "")]
+    assert [(e.time_s, e.job, e.arm) for e in log if e.kind == "expire"] == [(20.0, "hard", "")]
+    (lost,) = (e for e in log if e.kind == "give_up")
+    assert (lost.job, lost.arm, lost.time_s, lost.reason) == ("next", "", 20.0, "a job before it was given up")
 
 
 def test_a_job_behind_a_full_window_expires_too(small) -> None:
