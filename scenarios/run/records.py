@@ -429,7 +429,7 @@ def offers_of(event: Event, seen: Mapping[str, Observation], actions: Mapping[st
             free=bool(any(own.action_mask[1 + option] for option in slot)),
             difficulty=float(own.difficulty[best]) if best in known else None,
             peak_c=peak_c if able and peak_c else None,
-            p_saturation=float(own.p_saturation[best]) if able else None,
+            p_saturation=float(own.p_saturation[best]) if best in known or (able and peak_c) else None,  # 0.5 if unknown
             duration_s=float(own.duration_s[best]) if able else None,
             plan=best % plans if able else None,
         )

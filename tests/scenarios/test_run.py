@@ -72,6 +72,12 @@ def test_the_same_seed_gives_the_same_shift_without_an_illegal_action(fleet, pol
     assert one.metrics.illegal_actions == 0
 
 
+def test_offers_of_arms_without_predictions_have_none(result):
+    assert result.offers
+    assert {(o.difficulty, o.peak_c, o.p_saturation) for o in result.offers} == {(None, None, None)}
+    assert all(o.duration_s for o in result.offers if o.feasible)
+
+
 def test_another_seed_gives_another_shift(fleet, result):
     assert not same(result, run(fleet, spec(seed=1)))
 
