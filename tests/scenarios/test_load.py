@@ -99,6 +99,10 @@ WRONG = [
     (put("horizon_s", math.nan), "horizon_s: expected a finite number, got nan."),
     (put("horizon_s", 1e9), "horizon_s must be at most 1000000 times telemetry_interval_s"),
     (put("telemetry_interval_s", 100), "telemetry_interval_s must not exceed decision_interval_s"),
+    (
+        put("horizon_s", 187.5),
+        "horizon_s must be a multiple of decision_interval_s (got 187.5, 10): give 180 or 190.",
+    ),
     (put("decision_interval_s", 1e6), "decision_interval_s must not exceed horizon_s (got 1000000.0, "),
     (put("slots", 2.5), "slots: expected a whole number, got a number (2.5)."),
     (put("slots", 0), "slots must be between 1 and 256 (got 0)."),
@@ -325,6 +329,13 @@ def test_an_override_changes_that_field_and_no_other():
     assert changed.ambient.points == ((0.0, 30.0),)
     assert override(changed, horizon_s=base.horizon_s, ambient=base.ambient) == base
     assert override(base) == base
+
+
+def test_a_shift_of_many_intervals_that_no_float_holds_exactly_is_accepted():
+    scenario = parse_scenario(
+        small() | {"horizon_s": 1800.3, "decision_interval_s": 0.3, "telemetry_interval_s": 0.3}, FILE
+    )
+    assert scenario.ticks == 6001
 
 
 @pytest.mark.parametrize(
