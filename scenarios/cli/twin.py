@@ -463,7 +463,7 @@ def score_command(
         check_file(map_, (".png",), overwrite, "--map")
     from scenarios.motion.verdict_map import verdict_png
     from scenarios.prepare.twins import open_twin
-    from scenarios.show.twin_scores import job_rows, jobs_of_arm, log_rows, render, window_rows, with_verdicts
+    from scenarios.show.twin_scores import job_rows, jobs_of_arm, log_rows, of_each, render, window_rows, with_verdicts
     from scenarios.spec.load import load
     from twin.verdict import Rule
 
@@ -480,7 +480,7 @@ def score_command(
         if rule:
             rows, features = log_rows(rule, recordings)
         else:
-            rows = [row for recording in recordings for row in window_rows(twin, recording)]
+            rows = [row for _, own in of_each(recordings, partial(window_rows, twin)) for row in own]
     caption = f"twin of {twin.arm}, version {twin.version}, data {twin.data_hash}"
     if rule and features is not None:
         rows = with_verdicts(rows, rule, features)

@@ -171,6 +171,20 @@ def test_a_damaged_log_can_be_read_without_its_bad_lines(thermofleet, twins, tmp
     assert len(said.out.splitlines()) == 1 + 2  # the head and two windows of 25 s
 
 
+def test_a_recording_shorter_than_a_window_does_not_stop_the_scores_of_its_folder(
+    thermofleet, trained, tmp_path, caplog
+):
+    for name, seconds in (("long", 60), ("brief", 20)):
+        (tmp_path / f"{name}.csv").write_text(log_csv(seconds, celsius=30.0), encoding="utf-8")
+    score = ("twin", "score", trained, "--log")
+    said = thermofleet(*score, tmp_path, "--format", "csv").succeeded()
+    assert [row["log"] for row in csv.DictReader(io.StringIO(said.out))] == ["long", "long"]
+    sentence = "'brief' has no stretch of 25 s without a gap, which one window needs."
+    assert caplog.messages == [f"{sentence} It is left out."]
+    (tmp_path / "long.csv").unlink()
+    assert thermofleet(*score, tmp_path).refused(sentence)
+
+
 def test_a_log_that_teaches_nothing_is_told_with_the_options_that_mend_it(thermofleet, logs, tmp_path):
     (tmp_path / "short.csv").write_text(log_csv(20, celsius=30.0), encoding="utf-8")
     some = ("--hidden", 4, "--epochs", 1, "--max-windows", 64, "--restarts", 1, "--beta", 1000)
