@@ -185,6 +185,19 @@ def test_a_recording_shorter_than_a_window_does_not_stop_the_scores_of_its_folde
     assert thermofleet(*score, tmp_path).refused(sentence)
 
 
+def test_a_log_with_a_dead_temperature_sensor_is_scored_without_temperatures(thermofleet, trained, tmp_path):
+    rows = list(csv.reader(io.StringIO(log_csv(60, celsius=30.0))))
+    dead, without = tmp_path / "dead.csv", tmp_path / "without.csv"
+    for number, row in enumerate(rows[1:]):
+        row[-7:] = ["0.0", *(f"{30 + 0.01 * number:.2f}" for _ in range(6))]
+    dead.write_text("\n".join(map(",".join, rows)) + "\n", encoding="utf-8")
+    without.write_text("\n".join(",".join(row[:-7]) for row in rows) + "\n", encoding="utf-8")
+    advice = "`thermofleet twin score` needs none: give it a plain log (docs/logs.md) without any temp_c column."
+    assert thermofleet("twin", "score", trained, "--log", dead).refused(advice)
+    thermofleet("twin", "score", trained, "--log", without).succeeded()
+    assert thermofleet("twin", "identify", "--log", without).refused("has no motor temperatures")
+
+
 def test_a_log_that_teaches_nothing_is_told_with_the_options_that_mend_it(thermofleet, logs, tmp_path):
     (tmp_path / "short.csv").write_text(log_csv(20, celsius=30.0), encoding="utf-8")
     some = ("--hidden", 4, "--epochs", 1, "--max-windows", 64, "--restarts", 1, "--beta", 1000)
