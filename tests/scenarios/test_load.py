@@ -313,6 +313,15 @@ def test_a_trace_in_minutes_or_partly_in_milliseconds_is_asked_about(tmp_path, c
     assert "Are these milliseconds? 118000 ms is 118 s." in caplog.text
 
 
+@pytest.mark.parametrize(("last", "asked"), [(1, True), (3600, False), (5, False)])
+def test_two_ambient_temperatures_in_hours_are_asked_about(tmp_path, caplog, last, asked):
+    text = SMALL.replace("horizon_s = 180", "horizon_s = 3600")
+    (tmp_path / "cell.toml").write_text(f"{text}\n[ambient]\npoints = [[0, 22], [{last}, 28]]\n", encoding="utf-8")
+    load(tmp_path / "cell.toml")
+    sentence = "cell.toml: ambient.points: the last time is 1. Are these hours? 1 h is 3600 s. Give seconds."
+    assert caplog.messages == ([sentence] if asked else [])
+
+
 def test_a_run_without_a_job_ends_with_the_reason(thermofleet, small_toml, tmp_path):
     text = small_toml.read_text(encoding="utf-8").replace("every_s = 30", "every_s = 1e6")
     small_toml.write_text(text.replace("count = 2", "count = 2, start_s = 200"), encoding="utf-8")
