@@ -16,8 +16,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from scenarios.cli.main import main
-from scenarios.cli.twin import doubts_of, network_of, subject_of
+from scenarios.cli.twin import SHOWN_OF_LOG, doubts_of, network_of, subject_of
+from scenarios.prepare.twins import LOG_INPUT
 from tests.logs import RATE_HZ, logged
+from twin.vae.config import TwinConfig
 from twin.vae.measures import TAU
 from twin.vae.twin import load
 
@@ -196,6 +198,12 @@ def test_a_log_with_a_dead_temperature_sensor_is_scored_without_temperatures(the
     assert thermofleet("twin", "score", trained, "--log", dead).refused(advice)
     thermofleet("twin", "score", trained, "--log", without).succeeded()
     assert thermofleet("twin", "identify", "--log", without).refused("has no motor temperatures")
+
+
+def test_the_help_of_training_has_the_defaults_of_twins_of_logs():
+    of_scenario = TwinConfig()
+    shown = {name: f"{getattr(of_scenario, name):g}; --log: {value:g}" for name, value in LOG_INPUT.items()}
+    assert shown == SHOWN_OF_LOG
 
 
 def test_a_log_that_teaches_nothing_is_told_with_the_options_that_mend_it(thermofleet, logs, tmp_path):
