@@ -350,6 +350,15 @@ def _unit_of(temp_c: Array) -> str:
     return f"{'Are these ' + ' or '.join(fits) + '? ' if fits else ''}Give °C."
 
 
+_NEEDED = "Every command needs it: repair it and record again."
+_WITHOUT = {
+    "temp_c": "Identification, training and forecasts need the temperatures of all joints: repair it and record "
+    "again. `thermofleet twin score` needs none: give it a plain log (docs/logs.md) without any temp_c column.",
+    "current_a": "A plain log (docs/logs.md) without any current_a column is read, too: its torques replace them.",
+}
+"""What can be done with a log one of whose sensors is dead, by channel; of others, `_NEEDED`."""
+
+
 def _stuck(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]:
     """Sensors that repeat one reading while those of the other joints change, or while the arm moves.
 
@@ -382,7 +391,7 @@ def _stuck(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]
                     continue
                 stands = "never changes, but its velocity does" if channel == "q" else f"is {value:.5g}"
                 what = f"{_NAMES[channel]} of joint {j + 1} {stands}, for {span_s:.4g} s"
-                remedy = "Is its sensor dead? Leave out what was not measured."
+                remedy = f"Is its sensor dead? {_WITHOUT.get(channel, _NEEDED)}"
                 if value == 0.0 and j == JOINTS - 1 and channel != "q":
                     remedy = "Is this an arm with six joints, padded with zeros? Only logs of a Gen3 (seven) are read."
                 yield BadReading(what, remedy, np.arange(a if value == 0.0 else a + 1, b + 1))

@@ -16,16 +16,21 @@ LogWindows = list[tuple[Stretch, Array, Features]]
 """Windows of stretches without gaps: the first sample of each, [window], and their features, [window, joint]."""
 
 
+class TooShort(FleetError):
+    """A recording has no stretch of one window."""
+
+
 def log_windows(twin: Twin, recording: Recording) -> LogWindows:
     """Each stretch without gaps with the first samples of its windows, which do not overlap, and their features.
 
     Raises:
-        FleetError: the recording has another number of joints than the twin, or no stretch of one window.
+        FleetError: the recording has another number of joints than the twin.
+        TooShort: it has no stretch of one window.
     """
     _check_joints(twin, recording)
     parts = _windows(twin, recording)
     if not parts:
-        raise FleetError(
+        raise TooShort(
             f"'{recording.name}' has no stretch of {twin.config.window / twin.config.rate_hz:g} s without a gap, which "
             "one window needs."
         )

@@ -228,6 +228,7 @@ def view_command(
 
     Motors are coloured by temperature. Close the window of the viewer to end.
     """
+    _check_subject(what)
     width, height = _size(size)
     shot = Shot(**given, width=width, height=height)
     suffix = "" if out is None else out.suffix.lower()
@@ -253,8 +254,21 @@ def view_command(
         _write_scene(Path(what), out, every, shot.speed)
 
 
+def _check_subject(what: str) -> None:
+    """Raise a FleetError if there is neither a folder, a file nor a scenario of a name."""
+    from fleet.errors import nearest
+    from scenarios.spec.load import INSTANCE, library
+
+    known = library()
+    if not (Path(what).exists() or what in known or INSTANCE.fullmatch(what) or what.endswith(".toml")):
+        raise FleetError(f"There is neither a folder nor a scenario '{what}'{nearest(what, known)}")
+
+
 def _play(what: str, shot: Shot) -> None:
     """Play a run, or show the cell of a scenario, until the window is closed."""
+    from scenarios.spec.load import load
+
+    scenario = None if (Path(what) / "run.json").exists() else load(what)
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise FleetError(NO_DISPLAY)
     import numpy as np
@@ -263,9 +277,8 @@ def _play(what: str, shot: Shot) -> None:
     from scenarios.run.log import open_run
     from scenarios.show.film import Film
     from scenarios.show.moments import motor_drums
-    from scenarios.spec.load import load
 
-    if (Path(what) / "run.json").exists():
+    if scenario is None:
         run = open_run(Path(what))
         film, began_s = Film(run, meshes=shot.meshes), time.monotonic()
         last_s = min(shot.end_s, float(run.readings.time_s[-1]))
@@ -275,7 +288,6 @@ def _play(what: str, shot: Shot) -> None:
             return film.show(min(shot.begin_s + shot.speed * (time.monotonic() - began_s), last_s))
 
     else:
-        scenario = load(what)
         robots = [arm.robot() for arm in scenario.arms]
         player = CellPlayer(robots, scenario.places, scenario.fixtures, meshes=shot.meshes)
         home = np.array([robot.home_q() for robot in robots])
@@ -380,6 +392,8 @@ def report_command(
 
     if as_json and trace is None:
         raise FleetError("--json is for --trace: leave it out.")
+    if missing := [folder for folder in folders or () if not folder.is_dir()]:
+        raise FleetError(f"There is no folder '{missing[0]}'. Give the folder of a run or of a recording.")
     if folders and len(folders) > 1:
         if trace is not None or scenario is not None or meshes:
             raise FleetError("--trace, --scenario and --meshes are for one folder: leave them out, or give one folder.")

@@ -3,12 +3,12 @@
 import inspect
 import shlex
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import MISSING, Field, dataclass, fields, replace
 from functools import wraps
 from pathlib import Path
-from types import NoneType, UnionType
+from types import MappingProxyType, NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
 
 import typer
@@ -38,14 +38,18 @@ class From:
     Args:
         kind: A dataclass whose fields are declared with `fleet.fields.option`.
         names: The fields; all of them if there are none.
+        shown: Texts of defaults that depend on other options of this command, by field.
         defaults: Of fields whose default is another one in this command.
     """
 
-    def __init__(self, kind: type, *names: str, **defaults: Any) -> None:
+    def __init__(
+        self, kind: type, *names: str, shown: Mapping[str, str] = MappingProxyType({}), **defaults: Any
+    ) -> None:
         known = options_of(kind)
         self.defaults = defaults
         self.options = {name: known[name] for name in names or known}
         self.options |= {name: replace(known[name], shown=None) for name in defaults}
+        self.options |= {name: replace(known[name], shown=text) for name, text in shown.items()}
         self.fields: dict[str, Field[Any]] = {each.name: each for each in fields(kind) if each.name in self.options}
 
     def parameters(self) -> list[inspect.Parameter]:

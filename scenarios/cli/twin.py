@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 KNOWN_TWINS = option("A folder of twins. Default: those of the scenario, from the cache.", None, flag="--twins")
 SEED = option("Random seed.", 0, low=0, high=MAX_SEED)
 _VERDICT = "Verdicts"
+SHOWN_OF_LOG = {"hidden": "16; --log: 32", "window": "12; --log: 50", "rate_hz": "12.5; --log: 2"}
+"""Defaults that differ for twins of logs, as the help shows them: `LOG_INPUT`, whose module takes long to load."""
 FOLLOW_S = 0.1
 """Real seconds between two looks at a growing log."""
 
@@ -360,7 +362,7 @@ def train_command(
         is_name=True,
     ),
     *,
-    given: Annotated[Given, From(TwinConfig)],
+    given: Annotated[Given, From(TwinConfig, shown=SHOWN_OF_LOG)],
     size: Literal["quick", "full"] | None = option("quick or full. Default: as in the scenario; for logs quick.", None),
     cool: float = option("--log: temperature limit of joints 1 to 4 for training data, °C.", 40.0, low=0, high=200),
     hold_out: float = option(
@@ -463,7 +465,7 @@ def score_command(
         check_file(map_, (".png",), overwrite, "--map")
     from scenarios.motion.verdict_map import verdict_png
     from scenarios.prepare.twins import open_twin
-    from scenarios.show.twin_scores import job_rows, jobs_of_arm, log_rows, render, window_rows, with_verdicts
+    from scenarios.show.twin_scores import job_rows, jobs_of_arm, log_rows, of_each, render, window_rows, with_verdicts
     from scenarios.spec.load import load
     from twin.verdict import Rule
 
@@ -480,7 +482,7 @@ def score_command(
         if rule:
             rows, features = log_rows(rule, recordings)
         else:
-            rows = [row for recording in recordings for row in window_rows(twin, recording)]
+            rows = [row for _, own in of_each(recordings, partial(window_rows, twin)) for row in own]
     caption = f"twin of {twin.arm}, version {twin.version}, data {twin.data_hash}"
     if rule and features is not None:
         rows = with_verdicts(rows, rule, features)

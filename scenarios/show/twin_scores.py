@@ -1,7 +1,10 @@
 """A twin's scores of a scenario's jobs or of a log, as a table, CSV or JSON."""
 
 import json
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -12,13 +15,15 @@ from scenarios.progress import Progress, quiet
 from scenarios.spec.jobs import all_works
 from scenarios.spec.schema import Scenario
 from scenarios.table import Column, Table
-from twin.log_windows import LogWindows, log_windows
+from twin.log_windows import LogWindows, TooShort, log_windows
 from twin.logs.recording import Recording
 from twin.vae.measures import Features, Measures
 from twin.vae.twin import Twin
 from twin.verdict import LogStretches, Rule, word
 
+_LOG = logging.getLogger(__name__)
 Array = np.ndarray
+T = TypeVar("T")
 ScoreRow = dict[str, str | float | int | None]
 LOADED = 2
 """Joint 2 carries most of a standing arm's load and ranks jobs best, so a table shows its d."""
@@ -60,11 +65,10 @@ def log_rows(rule: Rule, recordings: Sequence[Recording]) -> tuple[list[ScoreRow
     """One row of scores per recording, those of its worst stretches, and the features that are judged, [row, joint].
 
     Raises:
-        FleetError: as `twin.log_windows.log_windows`.
+        FleetError: as `of_each`.
     """
     rows, judged, twin = list[ScoreRow](), list[Array](), rule.twin
-    for recording in recordings:
-        log = LogStretches.of(twin, recording)
+    for recording, log in of_each(recordings, partial(LogStretches.of, twin)):
         features = log.worst(twin.joint_weight)
         judged.append(features.packed)
         measures, share = twin.measures_of(features), log.share(rule.anomalous(log.stretches))
@@ -72,6 +76,25 @@ def log_rows(rule: Rule, recordings: Sequence[Recording]) -> tuple[list[ScoreRow
         begins: ScoreRow = {"recording": recording.name, "minutes": recording.duration_s / 60}
         rows.append(begins | _scores(twin, measures, hottest_c=hottest_c, anomalous_share=share))
     return rows, Features(np.stack(judged))
+
+
+def of_each(recordings: Sequence[Recording], score: Callable[[Recording], T]) -> list[tuple[Recording, T]]:
+    """The recordings with their scores; one that is shorter than a window is left out with a warning.
+
+    Raises:
+        FleetError: as `twin.log_windows.log_windows`, TooShort only if no recording is left.
+    """
+    scored, short = list[tuple[Recording, T]](), list[TooShort]()
+    for recording in recordings:
+        try:
+            scored.append((recording, score(recording)))
+        except TooShort as error:
+            short.append(error)
+    if short and not scored:
+        raise short[0]
+    for error in short:
+        _LOG.warning("%s It is left out.", error)
+    return scored
 
 
 def with_verdicts(rows: Sequence[ScoreRow], rule: Rule, features: Features) -> list[ScoreRow]:

@@ -147,7 +147,7 @@ def _recurring(stream: Any, begin: datetime | None, horizon_s: float, where: str
         raise ScenarioError(f'{where}.at must be a list of times of day, as ["6:00", "14:30"] (got {times!r}).')
     clocks = [_clock(each, f"{where}.at") for each in times]
     days = _days(arrivals.get("weekdays", list(WEEKDAYS)), begin, horizon_s, where)
-    found = sorted({day_s(date, each) for day_s, date in days for each in clocks})
+    found = sorted(day_s(date, each) for day_s, date in days for each in clocks)  # each a job, also at one moment
     inside = [time_s for time_s in found if 0 <= time_s < horizon_s]
     if not inside:
         raise ScenarioError(f"{where}: none of these times lies within the shift of {horizon_s:g} s from {begin}.")

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from itertools import chain, combinations, pairwise
-from math import dist, inf, isfinite, nan
+from math import dist, inf, isclose, isfinite, nan
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -353,6 +353,7 @@ def _check(scenario: Scenario, path: Path) -> None:
     if faults:
         raise ScenarioError("\n".join(f"{file}: {fault}" for fault in faults))
     check_breaks(scenario, file)
+    _check_intervals(scenario, file)
     try:
         scenario.bus.check([arm.name for arm in scenario.arms])
     except ValueError as error:
@@ -372,6 +373,22 @@ def _check(scenario: Scenario, path: Path) -> None:
         raise ScenarioError(
             f"{file}: jobs: about {total:.3g} jobs would arrive in a shift; at most {MOST_JOBS} are allowed."
         )
+
+
+def _check_intervals(scenario: Scenario, file: str) -> None:
+    """Check that the shift ends with a decision interval.
+
+    Raises:
+        ScenarioError: it does not; names the nearest horizons that do.
+    """
+    horizon_s, interval_s = scenario.horizon_s, scenario.decision_interval_s
+    if isclose(scenario.ticks * interval_s, horizon_s, rel_tol=1e-9):
+        return
+    before, after = (f"{count * interval_s:.12g}" for count in (horizon_s // interval_s, horizon_s // interval_s + 1))
+    raise ScenarioError(
+        f"{file}: horizon_s must be a multiple of decision_interval_s (got {horizon_s:.12g}, {interval_s:.12g}): give "
+        f"{before} or {after}."
+    )
 
 
 def _with_traces(scenario: Scenario, path: Path) -> Scenario:

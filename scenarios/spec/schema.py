@@ -295,6 +295,7 @@ class Scenario:
     name: str
     description: str
     horizon_s: float
+    """In a scenario file a multiple of `decision_interval_s`."""
     arms: tuple[ArmSpec, ...]
     places: tuple[Place, ...]
     jobs: tuple[JobStream, ...]

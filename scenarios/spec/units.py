@@ -13,8 +13,8 @@ EPOCH_S, EPOCH_MS = 1e8, 1e11
 """Smallest times that are taken for seconds or milliseconds since 1970; shifts are shorter."""
 MOST = 1e15
 """Smallest number that is not looked at: it is refused for its size."""
-FEW = 3
-"""Times of which it cannot be said that they are minutes."""
+FEWEST_ARRIVALS, FEWEST_POINTS = 3, 2
+"""Different times of arrivals, or of ambient temperatures, of which it can be said that they are minutes."""
 MOST_NAMED = 3
 """Times that a warning names."""
 
@@ -117,7 +117,7 @@ def check_times(times_s: Sequence[float], horizon_s: float, where: str, names: S
         raise ScenarioError(f"{where} gives no job: there are no times. Give seconds from the begin of the shift.")
     if not horizon_s > 0:  # reported when the scenario is made
         return
-    question, last = _unit_of_times(times_s, horizon_s), max(times_s)
+    question, last = _unit_of_times(times_s, horizon_s, FEWEST_ARRIVALS), max(times_s)
     if not inside:
         which = "its only time is" if count == 1 else f"all {count} times are"
         raise ScenarioError(
@@ -138,7 +138,7 @@ def check_ambient(points: Sequence[tuple[float, float]], horizon_s: float, where
     times_s, hottest_c = [time_s for time_s, _ in points], max((c for _, c in points), default=0.0)
     if hottest_c >= HOT_CELL_C:
         _LOG.warning("%s: %g °C: is this °F? %s", where, hottest_c, _MEANT["°F"](hottest_c))
-    if times_s and (asked := _unit_of_times(times_s, horizon_s)):
+    if times_s and (asked := _unit_of_times(times_s, horizon_s, FEWEST_POINTS)):
         _LOG.warning("%s: the last time is %g.%s", where, max(times_s), asked)
 
 
@@ -148,7 +148,7 @@ def _first_outside(times_s: Sequence[float], horizon_s: float, names: Sequence[s
     return f": {', '.join(outside[:MOST_NAMED])}{', …' * (len(outside) > MOST_NAMED)}" if outside else ""
 
 
-def _unit_of_times(times_s: Sequence[float], horizon_s: float) -> str:
+def _unit_of_times(times_s: Sequence[float], horizon_s: float, fewest: int) -> str:
     first, last = min(times_s), max(times_s)
     if first >= EPOCH_S:
         unit, factor = ("milliseconds", 0.001) if first >= EPOCH_MS else ("seconds", 1.0)
@@ -159,6 +159,6 @@ def _unit_of_times(times_s: Sequence[float], horizon_s: float) -> str:
     if middle >= horizon_s and last / 1000 < horizon_s and last >= 10 * horizon_s:
         return f" Are these milliseconds? {last:g} ms is {last / 1000:g} s. Give seconds."
     for unit, short, unit_s in (("minutes", "min", 60), ("hours", "h", 3600), ("days", "d", 86_400)):
-        if len(set(times_s)) >= FEW and horizon_s / 2 <= unit_s * last <= horizon_s:
+        if len(set(times_s)) >= fewest and horizon_s / 2 <= unit_s * last <= horizon_s:
             return f" Are these {unit}? {last:g} {short} is {unit_s * last:g} s. Give seconds."
     return ""

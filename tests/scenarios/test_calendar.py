@@ -128,6 +128,13 @@ def test_recurring_jobs_arrive_at_their_times_of_day() -> None:
     assert len(parse_scenario(raw | {"jobs": [every_day]}, FILE).jobs[0].arrivals.times_s or ()) == 2
 
 
+def test_a_time_of_day_that_summer_time_moves_onto_another_is_still_a_job() -> None:
+    raw = small() | {"horizon_s": 20 * HOUR_S, "shift_begin": "2026-03-28T20:00", "time_zone": "Europe/Berlin"}
+    stream = raw["jobs"][0] | {"arrivals": {"kind": "weekly", "at": ["2:30", "3:30"]}}
+    arrivals = parse_scenario(raw | {"jobs": [stream]}, FILE).jobs[0].arrivals
+    assert arrivals.times_s == (6.5 * HOUR_S, 6.5 * HOUR_S)
+
+
 BREAK = {"name": "lunch", "begin": "4:00", "end": "5:00"}
 
 

@@ -99,6 +99,10 @@ WRONG = [
     (put("horizon_s", math.nan), "horizon_s: expected a finite number, got nan."),
     (put("horizon_s", 1e9), "horizon_s must be at most 1000000 times telemetry_interval_s"),
     (put("telemetry_interval_s", 100), "telemetry_interval_s must not exceed decision_interval_s"),
+    (
+        put("horizon_s", 187.5),
+        "horizon_s must be a multiple of decision_interval_s (got 187.5, 10): give 180 or 190.",
+    ),
     (put("decision_interval_s", 1e6), "decision_interval_s must not exceed horizon_s (got 1000000.0, "),
     (put("slots", 2.5), "slots: expected a whole number, got a number (2.5)."),
     (put("slots", 0), "slots must be between 1 and 256 (got 0)."),
@@ -309,6 +313,15 @@ def test_a_trace_in_minutes_or_partly_in_milliseconds_is_asked_about(tmp_path, c
     assert "Are these milliseconds? 118000 ms is 118 s." in caplog.text
 
 
+@pytest.mark.parametrize(("last", "asked"), [(1, True), (3600, False), (5, False)])
+def test_two_ambient_temperatures_in_hours_are_asked_about(tmp_path, caplog, last, asked):
+    text = SMALL.replace("horizon_s = 180", "horizon_s = 3600")
+    (tmp_path / "cell.toml").write_text(f"{text}\n[ambient]\npoints = [[0, 22], [{last}, 28]]\n", encoding="utf-8")
+    load(tmp_path / "cell.toml")
+    sentence = "cell.toml: ambient.points: the last time is 1. Are these hours? 1 h is 3600 s. Give seconds."
+    assert caplog.messages == ([sentence] if asked else [])
+
+
 def test_a_run_without_a_job_ends_with_the_reason(thermofleet, small_toml, tmp_path):
     text = small_toml.read_text(encoding="utf-8").replace("every_s = 30", "every_s = 1e6")
     small_toml.write_text(text.replace("count = 2", "count = 2, start_s = 200"), encoding="utf-8")
@@ -325,6 +338,13 @@ def test_an_override_changes_that_field_and_no_other():
     assert changed.ambient.points == ((0.0, 30.0),)
     assert override(changed, horizon_s=base.horizon_s, ambient=base.ambient) == base
     assert override(base) == base
+
+
+def test_a_shift_of_many_intervals_that_no_float_holds_exactly_is_accepted():
+    scenario = parse_scenario(
+        small() | {"horizon_s": 1800.3, "decision_interval_s": 0.3, "telemetry_interval_s": 0.3}, FILE
+    )
+    assert scenario.ticks == 6001
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from scenarios.cli.main import main
-from scenarios.cli.twin import doubts_of, network_of, subject_of
+from scenarios.cli.twin import SHOWN_OF_LOG, doubts_of, network_of, subject_of
+from scenarios.prepare.twins import LOG_INPUT
 from tests.logs import RATE_HZ, logged
+from twin.vae.config import TwinConfig
 from twin.vae.measures import TAU
 from twin.vae.twin import load
 
@@ -169,6 +171,39 @@ def test_a_damaged_log_can_be_read_without_its_bad_lines(thermofleet, twins, tmp
     assert "--skip-damaged" in refused.err
     said = thermofleet("twin", "score", twins, "--log", damaged, "--format", "csv", "--skip-damaged").succeeded()
     assert len(said.out.splitlines()) == 1 + 2  # the head and two windows of 25 s
+
+
+def test_a_recording_shorter_than_a_window_does_not_stop_the_scores_of_its_folder(
+    thermofleet, trained, tmp_path, caplog
+):
+    for name, seconds in (("long", 60), ("brief", 20)):
+        (tmp_path / f"{name}.csv").write_text(log_csv(seconds, celsius=30.0), encoding="utf-8")
+    score = ("twin", "score", trained, "--log")
+    said = thermofleet(*score, tmp_path, "--format", "csv").succeeded()
+    assert [row["log"] for row in csv.DictReader(io.StringIO(said.out))] == ["long", "long"]
+    sentence = "'brief' has no stretch of 25 s without a gap, which one window needs."
+    assert caplog.messages == [f"{sentence} It is left out."]
+    (tmp_path / "long.csv").unlink()
+    assert thermofleet(*score, tmp_path).refused(sentence)
+
+
+def test_a_log_with_a_dead_temperature_sensor_is_scored_without_temperatures(thermofleet, trained, tmp_path):
+    rows = list(csv.reader(io.StringIO(log_csv(60, celsius=30.0))))
+    dead, without = tmp_path / "dead.csv", tmp_path / "without.csv"
+    for number, row in enumerate(rows[1:]):
+        row[-7:] = ["0.0", *(f"{30 + 0.01 * number:.2f}" for _ in range(6))]
+    dead.write_text("\n".join(map(",".join, rows)) + "\n", encoding="utf-8")
+    without.write_text("\n".join(",".join(row[:-7]) for row in rows) + "\n", encoding="utf-8")
+    advice = "`thermofleet twin score` needs none: give it a plain log (docs/logs.md) without any temp_c column."
+    assert thermofleet("twin", "score", trained, "--log", dead).refused(advice)
+    thermofleet("twin", "score", trained, "--log", without).succeeded()
+    assert thermofleet("twin", "identify", "--log", without).refused("has no motor temperatures")
+
+
+def test_the_help_of_training_has_the_defaults_of_twins_of_logs():
+    of_scenario = TwinConfig()
+    shown = {name: f"{getattr(of_scenario, name):g}; --log: {value:g}" for name, value in LOG_INPUT.items()}
+    assert shown == SHOWN_OF_LOG
 
 
 def test_a_log_that_teaches_nothing_is_told_with_the_options_that_mend_it(thermofleet, logs, tmp_path):

@@ -187,9 +187,15 @@ WHOLE = {
     "an angle that stands for a minute": (rows_set("Pos", 1, 10, 270, 330.0), "angle of joint 2 never changes"),
     "columns between bars": (lambda: sound().text().replace(",", "|"), "Columns are separated by commas"),
     "a velocity not measured": (changed("Velocity", np.zeros_like, 3), "velocity of joint 4 never changes"),
-    "a dead current sensor": (changed("Current", lambda v: np.full_like(v, 0.4), 5), "current of joint 6 is 0.4, for"),
-    "torque that dies midway": (changed("Torque", held, 2), "torque of joint 3 is .* sensor dead"),
-    "sensor that dies midway": (changed("Temp", held, 1), "temperature of joint 2 is .* sensor dead"),
+    "a dead current sensor": (
+        changed("Current", lambda v: np.full_like(v, 0.4), 5),
+        "current of joint 6 is 0.4, for .* without any current_a column is read",
+    ),
+    "torque that dies midway": (
+        changed("Torque", held, 2),
+        r"torque of joint 3 is .* sensor dead\? Every command needs it",
+    ),
+    "sensor that dies midway": (changed("Temp", held, 1), r"joint 2 is .* dead\? .* twin score` needs none"),
     "all temperatures stand": (lambda: stood(sound(rows=800)), "temperature of joint 1 is 3.* sensor dead"),
     "newest line first": (
         lambda: "\n".join([",".join(NAMES), *sound().text().splitlines()[:0:-1], ""]),

@@ -331,6 +331,33 @@ def test_a_file_that_cannot_be_is_refused(
     assert [path.name for path in tmp_path.iterdir()] == ["there.mcap"]
 
 
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["report", "nowhere"], "There is no folder 'nowhere'. Give the folder of a run or of a recording."),
+        (["report", "nowhere", "--trace", "fault"], "There is no folder 'nowhere'."),
+        (["report", "RUN", "nowhere"], "There is no folder 'nowhere'."),
+        (["view", "nowhere"], "There is neither a folder nor a scenario 'nowhere'. Allowed: active_waiting,"),
+        (["view", "quikstart"], "nor a scenario 'quikstart'; did you mean 'quickstart'?"),
+        (["view", "nowhere", "--out", "shift.glb"], "There is neither a folder nor a scenario 'nowhere'."),
+        (["view", "nowhere.toml"], "There is no scenario file 'nowhere.toml'."),
+        (["view", "quickstart"], "MuJoCo's viewer needs a display"),
+        (["view", "RUN"], "MuJoCo's viewer needs a display"),
+    ],
+)
+def test_a_folder_or_scenario_that_does_not_exist_is_named(
+    run_folder: Path, tmp_path: Path, monkeypatch, capsys, arguments, told
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(SystemExit) as ended:
+        main([str(run_folder) if each == "RUN" else each for each in arguments])
+    assert ended.value.code == 2
+    assert told in " ".join(capsys.readouterr().err.split())
+
+
 def test_runs_side_by_side_are_one_page_and_one_table(run_folder: Path, thermofleet, tmp_path: Path, capsys) -> None:
     openpyxl = pytest.importorskip("openpyxl")
     again = shutil.copytree(run_folder, tmp_path / "again")
