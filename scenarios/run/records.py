@@ -419,6 +419,7 @@ def offers_of(event: Event, seen: Mapping[str, Observation], actions: Mapping[st
         known = [option for option in able if own.known[option]]
         best = chosen if arm == event.arm else min(known or able, key=lambda o: own.difficulty[o], default=-1)
         peak_c = float(own.peak_c[best])
+        predicted = best in known or (bool(able) and peak_c > 0.0)  # a P that is unknown is 0.5
         yield Offer(
             time_s=event.time_s,
             job=event.job,
@@ -429,7 +430,7 @@ def offers_of(event: Event, seen: Mapping[str, Observation], actions: Mapping[st
             free=bool(any(own.action_mask[1 + option] for option in slot)),
             difficulty=float(own.difficulty[best]) if best in known else None,
             peak_c=peak_c if able and peak_c else None,
-            p_saturation=float(own.p_saturation[best]) if best in known or (able and peak_c) else None,  # 0.5 if unknown
+            p_saturation=float(own.p_saturation[best]) if predicted else None,
             duration_s=float(own.duration_s[best]) if able else None,
             plan=best % plans if able else None,
         )
