@@ -384,10 +384,11 @@ def _check_intervals(scenario: Scenario, file: str) -> None:
     horizon_s, interval_s = scenario.horizon_s, scenario.decision_interval_s
     if isclose(scenario.ticks * interval_s, horizon_s, rel_tol=1e-9):
         return
-    before, after = (f"{count * interval_s:.12g}" for count in (horizon_s // interval_s, horizon_s // interval_s + 1))
+    before = horizon_s // interval_s
+    nearest_s = " or ".join(f"{count * interval_s:.12g}" for count in (before, before + 1) if count)
     raise ScenarioError(
         f"{file}: horizon_s must be a multiple of decision_interval_s (got {horizon_s:.12g}, {interval_s:.12g}): give "
-        f"{before} or {after}."
+        f"{nearest_s}."
     )
 
 
