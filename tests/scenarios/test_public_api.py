@@ -69,7 +69,7 @@ class Mine:
         (lambda: tf.run("quickstart", seed=1.5), r"^seed must be an integer \(got 1.5\)"),
         (lambda: tf.run("quickstart", polcy="wspt"), r"no option 'polcy'; did you mean 'policy'\? Allowed: bus, "),
         (lambda: tf.prepare("quickstart", training=1.5), r"training must be an integer >= 0 \(got 1.5\)"),  # pyright: ignore
-        (lambda: tf.make_env("quickstart", slot=3), "Allowed: ambient, arms, bids, breaks, bus, cache, "),
+        (lambda: tf.make_env("quickstart", slot=3), "Allowed: ahead_s, ambient, arms, bids, breaks, bus, cache, "),
     ],
 )  # fmt: skip
 def test_arguments_are_checked(call, says):

@@ -455,8 +455,12 @@ def test_300_unfinished_requests_hold_nobody_up(router, arm, begun, monkeypatch)
         for _ in range(300):
             line = lines.enter_context(socket.create_connection(("127.0.0.1", served.port)))
             line.sendall(begun.encode())
+        replies = []
         for request in (("GET", "/v4/fleet"), ("POST", "/v4/jobs", {"jobs": [CRATE_JSON]})):
-            wait_until(lambda request=request: served.ask(*request)[0] == 200)  # the rate is limited, too
+            try:  # the rate is limited, too
+                wait_until(lambda request=request: replies.append(served.ask(*request)) or replies[-1][0] == 200)
+            finally:
+                assert replies[-1][0] == 200, replies[-1]
 
 
 def test_requests_beyond_the_rate_are_refused_until_a_pause(router, monkeypatch):
