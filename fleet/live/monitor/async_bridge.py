@@ -198,8 +198,8 @@ class AsyncBridge:
     async def _query(self, key: str, request: msgspec.Struct, kind: type[Reply], timeout_s: float) -> Replies[Reply]:
         def query(done: Callable[[Replies[Reply] | BusError], None]) -> None:
             try:
-                if self._listener.view.lost_s is not None:
-                    raise BusError("The connection to the router is lost: it has ended, hangs, or is unreachable.")
+                if not self._link.connected:
+                    raise BusError("The connection to the router is lost: it has ended, or is unreachable.")
                 self._link.query(key, request, kind, done, timeout_s=timeout_s)
             except BusError as error:
                 done(error)
