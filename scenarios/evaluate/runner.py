@@ -196,8 +196,8 @@ def run_study(
         require_extra("report")
     with nullcontext(Store()) if out is None else opened(out, study.card) as store:
         # The largest first, so that processes end together; what shares plans follows.
-        done = [key for key, row in store.rows.items() if row.error is None]
-        if failed := sum(key in store.rows and store.rows[key].error is not None for key in wanted):
+        done = {key for key, row in store.rows.items() if row.error is None}
+        if failed := sum(key in store.rows and key not in done for key in wanted):
             tell(f"Running again what failed before: {failed} shift{'s' * (failed > 1)}.")
         units = sorted(study.units(done), key=lambda unit: (-unit.size, unit.cell))
         # The folder is stated here, because a worker may have started with another one; other machines have their own.
