@@ -28,7 +28,7 @@ from fleet.bus.protocol.keys import BusChannel, Pattern, channel_for, channel_of
 from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, check_name, decode, encode, encoding
 from fleet.bus.router import Connection
 from fleet.bus.security.access_control import RosterEntry, rights_by_role
-from fleet.bus.security.tls import expires_at, has_expired, participant_at
+from fleet.bus.security.tls import expires_at, is_past, participant_at
 from fleet.errors import BusError, Refused, RefusedForNow
 
 _LOG = logging.getLogger(__name__)
@@ -174,7 +174,7 @@ class BusClient(Connection):
     @property
     def expiry(self) -> str:
         """Sentence that its certificate has expired; "" if it has not, and without TLS."""
-        if self._expires is None or not has_expired(self._expires):
+        if self._expires is None or not is_past(self._expires):
             return ""
         return (
             f"The certificate of '{self.participant}' expired on {self._expires:%Y-%m-%d %H:%M} UTC, so it has no "

@@ -24,9 +24,9 @@ Array = np.ndarray
 
 AWARD, LOST, ILLEGAL, WARNING, FINISH, HOME, FAULT, RETURN, GIVE_UP, RECOVER, MOVED, GIVE_BACK, EXPIRE = range(13)
 FAILURE, BREAK, BREAK_END = range(13, 16)
+"""Kinds of recorded events, in the order in which those of one step are reported."""
 FOLLOWS = -1.0
 """Value of the GIVE_UP of a job that waited for one that was given up."""
-"""Kinds of recorded events, in the order in which those of one step are reported."""
 PER_ARM = 10
 """Most events of one arm in one step; besides, every job may expire or be given up."""
 

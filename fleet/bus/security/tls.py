@@ -12,11 +12,14 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 from urllib.parse import unquote
 
 from fleet.bus.security.access_control import ROLES, Role, RosterEntry, file_of
 from fleet.errors import BusError
+
+if TYPE_CHECKING:  # plain TCP does not need the library
+    from cryptography import x509
 
 _LOG = logging.getLogger(__name__)
 
@@ -108,13 +111,12 @@ def participant_at(endpoint: str) -> RosterEntry | None:
     Raises:
         BusError: the certificate is missing or damaged.
     """
-    _, tls = identified(endpoint)
-    if tls is None:
+    certificate = _certificate_at(endpoint)
+    if certificate is None:
         return None
-    # Imported late: plain TCP does not need the library.
-    from fleet.bus.security.certificates import common_name, read
+    from fleet.bus.security.certificates import common_name
 
-    role, _, name = common_name(read(tls.folder, tls.file)).partition(":")
+    role, _, name = common_name(certificate).partition(":")
     return RosterEntry(unquote(name), cast(Role, role)) if role in ROLES else None
 
 
@@ -124,18 +126,22 @@ def expires_at(endpoint: str) -> datetime | None:
     Raises:
         BusError: the certificate is missing or damaged.
     """
+    certificate = _certificate_at(endpoint)
+    return None if certificate is None else certificate.not_valid_after_utc
+
+
+def _certificate_at(endpoint: str) -> "x509.Certificate | None":
     _, tls = identified(endpoint)
     if tls is None:
         return None
-    # Imported late: plain TCP does not need the library.
     from fleet.bus.security.certificates import read
 
-    return read(tls.folder, tls.file).not_valid_after_utc
+    return read(tls.folder, tls.file)
 
 
-def has_expired(expires: datetime | None) -> bool:
-    """Whether a certificate that expires then, None for never, is no longer valid."""
-    return expires is not None and datetime.now(UTC) >= expires
+def is_past(moment: datetime) -> bool:
+    """Whether a moment, as the end of a certificate, is over by the clock of this machine."""
+    return datetime.now(UTC) >= moment
 
 
 _NO_REPLY = "the server does not use TLS: no reply to the handshake"
