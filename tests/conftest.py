@@ -34,6 +34,9 @@ from tests.commands import start_server
 # A shell starts background jobs with Ctrl-C ignored, and their child processes inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# Tests have a router and all its sessions in one process, where two receiving threads are too few on a busy machine.
+os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 8))")
+
 
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile the engine before xdist starts workers: each would compile it, at the same time.

@@ -228,6 +228,9 @@ class Router(Session):
 
     `with Router() as router:` listens on a free port of 127.0.0.1 until the end of the block. Linked routers (Zenoh's
     router mode) forward messages between their sessions; each enforces the access control for its own ones.
+
+    Sessions of its own process share Zenoh's two receiving threads with it, so that a large history (20 MB, on a busy
+    machine) can close their connections again and again; in processes of their own they did not.
     """
 
     def __init__(

@@ -410,10 +410,15 @@ def test_a_silent_stream_sends_heartbeats(monkeypatch):
         assert any(": heartbeat" in file.readline() for _ in range(30))
 
 
-def test_a_stuck_reader_is_dropped_and_delays_no_other(router, arm, monkeypatch):
+def test_a_stuck_reader_is_dropped_and_delays_no_other(monkeypatch):
     big = "x" * 4000
     monkeypatch.setattr("scenarios.live.gateway.STUCK_S", 0.5)
-    with Served(router) as served, served.stream(receive_bytes=4096), served.stream() as (_, file):
+    with ExitStack() as stack:  # of its own: who joins a fleet later would get all these events
+        router = stack.enter_context(Router()).endpoint
+        arm = stack.enter_context(MovingFleet(router, ("arm_0",), fleet="f"))
+        served = stack.enter_context(Served(router))
+        stack.enter_context(served.stream(receive_bytes=4096))
+        _, file = stack.enter_context(served.stream())
         wait_until(lambda: len(served.readers.connected) == 2)
         slowest_s = 0.0
         for number in range(600):  # far more than socket buffers hold
