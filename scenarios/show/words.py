@@ -22,10 +22,15 @@ LABELS = {"lost": "claim lost", "return": "job returned", "recover": "recovered"
 
 
 def clock(time_s: float, begin: datetime | None = None) -> str:
-    """A time of the shift as h:mm:ss; with its begin, which has a zone, the time of day, on later days with the day."""
+    """A time of the shift as h:mm:ss; with its begin, which has a zone, the time of day, on later days with the day.
+
+    Where clocks go back, the hour that occurs twice has the name of its zone.
+    """
     if begin is not None:
         moment = date_at(begin, time_s)
-        return f"{moment:%H:%M:%S}" if moment.date() == begin.date() else f"{moment:%a %d %b %H:%M:%S}"
+        twice = moment.replace(fold=0).utcoffset() != moment.replace(fold=1).utcoffset()
+        day = "" if moment.date() == begin.date() else "%a %d %b "
+        return f"{moment:{day}%H:%M:%S{' %Z' if twice else ''}}"
     seconds = round(time_s)
     return f"{seconds // 3600}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
 

@@ -117,6 +117,10 @@ def test_times_of_a_shift_are_times_of_day_with_summer_time() -> None:
         "20:00:00", "23:54:00", "Sun 29 Mar 01:00:00", "Sun 29 Mar 03:30:00",
     ]  # fmt: skip
     assert clock(6.5 * HOUR_S) == "6:30:00"
+    back = begin_of("2026-10-25T01:00+02:00", "Europe/Berlin")
+    assert [clock(hours_in * HOUR_S, back) for hours_in in (0.5, 1.5, 2.5, 3.5)] == [
+        "01:30:00", "02:30:00 CEST", "02:30:00 CET", "03:30:00",
+    ]  # fmt: skip
 
 
 def test_recurring_jobs_arrive_at_their_times_of_day() -> None:
