@@ -1,7 +1,7 @@
 """Health of a fleet: findings from a snapshot, clock replies and malformed messages."""
 
 from collections import Counter
-from collections.abc import Collection, Container, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from shlex import quote
@@ -31,6 +31,7 @@ EXPECTED = ("release", "predecessor", "paused", "queue", "break", "planning", "h
 """Classes of jobs that wait in order."""
 MOST_REASONS = 5
 NO_OFFSETS: Mapping[str, float] = {}
+NO_COMPLAINTS: Mapping[str, str] = {}
 OFFSET_S, SLOW_S = 1.0, 0.1
 """Real seconds: clock offsets and round trips above these are findings."""
 
@@ -133,7 +134,7 @@ def check_health(
             fleet,
             earlier,
             {a: off_s for a, off_s in offsets_s.items() if abs(off_s - common_s) > OFFSET_S},
-            _with_malformed_states(fleet, complaints),
+            complaints_of_states(fleet, complaints),
         ),
     ]
     if abs(common_s) > OFFSET_S:
@@ -171,19 +172,19 @@ def check_fleet(
     fleet: FleetSnapshot,
     earlier: FleetSnapshot | None,
     offsets_s: Mapping[str, float] = NO_OFFSETS,
-    malformed: Container[str] = (),
+    malformed: Mapping[str, str] = NO_COMPLAINTS,
 ) -> list[Finding]:
     """What snapshots show of arms, jobs and space: the findings that raise alarms, except that of a lost connection.
 
     Args:
         earlier: As in `check_health`.
         offsets_s: As in a report, of the arms whose offset is to be checked.
-        malformed: Arms whose last states were malformed, as far as it is known.
+        malformed: Why the last state of an arm was dropped as malformed, as far as it is known.
     """
     arms = (
         finding
         for arm in fleet.arms
-        for finding in check_arm(arm, offsets_s.get(arm.arm), malformed=arm.arm in malformed)
+        for finding in check_arm(arm, offsets_s.get(arm.arm), malformed=malformed.get(arm.arm, ""))
     )
     left_out = (check_left_out(arm, why) for arm, why in sorted(fleet.left_out.items()))
     return [
@@ -321,17 +322,19 @@ def check_auctioneers(fleet: FleetSnapshot, probes: Sequence[ClockProbe], wanted
     return [Finding("fault", problem)]
 
 
-def _with_malformed_states(fleet: FleetSnapshot, complaints: Sequence[str]) -> set[str]:
-    """Arms about whose states there are complaints, which name the key."""
-    names = {arm.arm: f"'{keys.of_arm(fleet.fleet, arm.arm, 'state')}'" for arm in fleet.arms}
-    return {arm for arm, key in names.items() if any(key in complaint for complaint in complaints)}
+def complaints_of_states(fleet: FleetSnapshot, complaints: Sequence[str]) -> dict[str, str]:
+    """The last complaint about a state of each arm, without the key that it names."""
+    names = {f"under '{keys.of_arm(fleet.fleet, arm.arm, 'state')}': ": arm.arm for arm in fleet.arms}
+    return {
+        arm: complaint.partition(key)[2] for complaint in complaints for key, arm in names.items() if key in complaint
+    }
 
 
-def check_arm(arm: ArmSnapshot, offset_s: float | None, *, malformed: bool = False) -> list[Finding]:
+def check_arm(arm: ArmSnapshot, offset_s: float | None, *, malformed: str = "") -> list[Finding]:
     """Check the token, state, mode and clock of one arm.
 
     Args:
-        malformed: Whether its last states were malformed.
+        malformed: Why its last state was dropped as malformed; "" if it was not.
     """
     age_s = arm.state_age_s
     if not arm.token and age_s is None:
@@ -343,7 +346,8 @@ def check_arm(arm: ArmSnapshot, offset_s: float | None, *, malformed: bool = Fal
         problem = f"shows its token but publishes no {'valid ' if malformed else ''}state: {cause}"
     elif age_s > FRESH_S:
         problem = f"is stale, with a last state {age_s:.1f} s old: {cause}"
-    absent = f"{arm.arm} is absent: it has left, or its process hangs or has ended."
+    why = f"its states are malformed: {malformed}" if malformed else "it has left, or its process hangs or has ended."
+    absent = f"{arm.arm} is absent: {why}"
     findings = [Finding("fault", f"{arm.arm} {problem}", "absent", arm.arm, lasting=absent)] if problem else []
     if arm.doubled:
         findings.append(

@@ -193,6 +193,19 @@ def test_a_lost_connection_is_an_alarm_and_no_arm_is_called_absent(monkeypatch):
         assert listed() == {("connection", False)}
 
 
+def test_an_arm_is_absent_because_its_states_are_malformed_if_they_are(router, monkeypatch):
+    monkeypatch.setattr(alarms, "BEGIN_S", {"absent": 0.0})
+    with BusClient(router, "f") as link, Served(router) as gateway:
+        link.declare_token(keys.of_arm("f", "b", "alive"))
+
+        def said():
+            link._open().put(keys.of_arm("f", "b", "state"), b"{}")
+            return [each["what"] for each in gateway.ask("GET", "/v4/alarms")[2] if each["kind"] == "absent"]
+
+        (what,) = wait_until(said)
+        assert what.startswith("b is absent: its states are malformed: ")
+
+
 async def receiver(replies, requests):
     """A server that gives these statuses in turn, and puts what it received into a queue; None: it never replies."""
 
