@@ -52,7 +52,7 @@ MEANINGS: dict[EventKind, Meaning] = {
     ),
     "give_up": Meaning("Arms faulted in the job too often, or a job before it was given up: it is abandoned."),
     "give_back": Meaning("The arm returned its job after a cycle.", "cycles that are kept"),
-    "expire": Meaning("The due date passed before an arm began the job: it is abandoned."),
+    "expire": Meaning("The due date passed while the job waited, begun before or not: it is abandoned."),
     "recover": Meaning("The fault is cleared.", live=True),
     "moved": Meaning("A person moved the faulted arm home.", live=True),
     "contact": Meaning(

@@ -187,7 +187,7 @@ def _past_note(name: str, past: PastJobs) -> str:
     return f"It was {how} long ago, and is not done again; the recording has its result."
 
 
-EXPIRED = "expired: its due date passed before an arm had begun it."
+EXPIRED = "expired: its due date passed while it waited."
 
 
 def is_late(job: JobSpec, time_s: float) -> bool:

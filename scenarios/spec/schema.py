@@ -109,7 +109,7 @@ class JobStream:
     due: Literal["soft", "hard"] = "soft"
     """soft: a later finish is tardy. hard: a job that waits then expires, begun before or not."""
     after: tuple[str, ...] = ()
-    """Streams whose job of the same number must finish first."""
+    """Streams whose job of the same number must finish first; a stream without such a job is not waited for."""
     numbered: bool = True
     """Whether the names of its jobs have a number after that of the stream. False for a row of a job table."""
     row: str = field(default="", compare=False)

@@ -98,7 +98,7 @@ def test_a_job_that_still_waits_at_its_hard_due_date_is_given_up_with_its_succes
     fleet.until(lambda: fleet.is_everywhere("begun", "finished") and fleet.is_everywhere("soft", "finished"))
     known = fleet.known()[0]
     assert (known["late"].state, known["z"].state) == ("given_up", "given_up")
-    assert known["late"].reason == "expired: its due date passed before an arm had begun it."
+    assert known["late"].reason == "expired: its due date passed while it waited."
     assert known["z"].reason == "Given up, because it waits for 'late', which is given up or cancelled."
     assert known["begun"].finished_s > 60.0
 
