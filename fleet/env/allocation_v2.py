@@ -308,21 +308,20 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
 
     def _observations(self) -> tuple[dict[str, Any], Array]:
         """Observations by agent, and the masks [arm, option + 2]; all in arrays of their own."""
-        vectors, masks = self.layout.join(*self.batch.parts)[0], self.batch.engine.mask[0].copy()
-        arms = self.possible_agents
+        shared, own = self.batch.parts
+        vectors, masks = self.layout.join(shared[0], own[0]), self.batch.engine.mask[0].copy()
         if self._mask_in == "info":
-            return {arm: vectors[a] for a, arm in enumerate(arms)}, masks
-        return {arm: {"observation": vectors[a], "action_mask": masks[a]} for a, arm in enumerate(arms)}, masks
+            return dict(zip(self.possible_agents, vectors, strict=True)), masks
+        each = zip(self.possible_agents, vectors, masks, strict=True)
+        return {arm: {"observation": vector, "action_mask": mask} for arm, vector, mask in each}, masks
 
     def _infos(self, outcome: Array, masks: Array, elapsed_s: float) -> dict[str, dict[str, Any]]:
         *rewards, _, _, jobs_done, _ = outcome.tolist()
         of_all = {"jobs_done": jobs_done, "elapsed_s": elapsed_s, **dict(zip(REWARDS, rewards, strict=True))}
-        infos: dict[str, dict[str, Any]] = {
-            arm: {"faults": faults, "illegal": illegal, "peak_c": peak_c, "above_warning_s": above_s, **of_all}
-            for arm, (faults, illegal, peak_c, above_s) in zip(
-                self.possible_agents, self.batch.engine.infos[0].tolist(), strict=True
-            )
-        }
+        infos = dict[str, dict[str, Any]]()
+        for arm, of_arm in zip(self.possible_agents, self.batch.engine.infos[0].tolist(), strict=True):
+            infos[arm] = info = of_all.copy()
+            info["faults"], info["illegal"], info["peak_c"], info["above_warning_s"] = of_arm
         if self._mask_in != "obs":
             for a, info in enumerate(infos.values()):
                 info["action_mask"] = masks[a].copy()
