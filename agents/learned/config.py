@@ -74,7 +74,7 @@ class PpoConfig:
         "mappo (one critic for the whole fleet) or ippo (one critic per arm).", "mappo", choices=get_args(Algorithm)
     )
     size: NetworkSize = field(default_factory=NetworkSize)
-    envs: int = option("Shifts simulated in parallel.", 32, low=1, high=65_536)
+    envs: int = option("Shifts simulated in parallel; not with --suite.", 32, low=1, high=65_536)
     steps: int | None = option(
         "Steps of every env in an iteration; default: 16 with events, 128 with intervals.", None, low=1, high=65_536
     )
@@ -92,7 +92,7 @@ class PpoConfig:
         shown="",
     )
     decisions: Decisions = option(
-        "Length of a training step: events (until an arm has a choice) or interval.",
+        "Length of a training step: events (until an arm has a choice) or interval; not with --suite.",
         "events",
         choices=get_args(Decisions),
         noun="kind of step",
@@ -109,7 +109,9 @@ class PpoConfig:
     entropy: float = option("Weight of the entropy bonus; not with --suite.", 0.002, low=0, high=10)
     max_gradient: float = option("Largest norm of a gradient.", 0.5, low=0, high=1e6, above=True)
     reward_scale: float = option("Factor on rewards.", 0.1, low=0, high=1e6, above=True)
-    warm_start: str = option("Rule that the network imitates first, for example wspt; default: none.", "")
+    warm_start: str = option(
+        "Rule that the network imitates first, for example wspt; default: none. Not with --suite.", ""
+    )
     seed: int = option("Seed for shifts, initialisation and minibatches.", 0, low=0, high=MAX_SEED)
 
     def __post_init__(self) -> None:

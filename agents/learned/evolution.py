@@ -5,6 +5,7 @@ ICLR 2015 (Adam); Polyak & Juditsky, SIAM Journal on Control and Optimization 30
 """
 
 import json
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -107,8 +108,12 @@ LOG, CURVE, BOARD = "progress.jsonl", "curve.png", "tensorboard"
 class TrainingLog:
     """Rows of numbers in the folder of a training; a resumed training adds to them."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, done: int) -> None:
+        """Prepare the log; rows of iterations after the number `done`, of a process that was killed, are removed."""
         self._path, self._board = folder / LOG, None
+        rows = [row for row in read_log(folder) if row.get("number", row.get("iteration", 0)) <= done]
+        with atomic_path(self._path) as draft:
+            draft.write_text("".join(f"{json.dumps(row)}\n" for row in rows), encoding="utf-8")
         if find_spec("tensorboard") and find_spec("torchrl"):
             from torchrl.record.loggers.tensorboard import TensorboardLogger
 
@@ -125,5 +130,9 @@ class TrainingLog:
 
 
 def read_log(folder: Path) -> list[dict[str, Any]]:
-    """The rows of a training, oldest first."""
-    return [json.loads(line) for line in (folder / LOG).read_text(encoding="utf-8").splitlines()]
+    """The rows of a training, oldest first, without damaged lines, as a power cut leaves one; none without a file."""
+    rows = list[dict[str, Any]]()
+    for line in (folder / LOG).read_bytes().splitlines() if (folder / LOG).is_file() else ():
+        with suppress(ValueError):
+            rows += [row] if isinstance(row := json.loads(line), dict) else []
+    return rows

@@ -200,6 +200,8 @@ def _mlp(widths: Sequence[int], *, last: bool = True) -> nn.Sequential:
 FORMAT = 6
 """Increase it when the network or its inputs change."""
 WEIGHTS, CARD = "policy.safetensors", "policy.json"
+LARGEST_WEIGHT = 1e6
+"""Magnitude; those of a trained network are below 10."""
 
 
 class LearnedPolicy:
@@ -274,7 +276,14 @@ def load_policy(folder: Path) -> LearnedPolicy:
     """
     actor = Actor(read_card(folder / CARD, PolicyCard, format_=FORMAT, what="trained policy").size)
     try:
-        actor.load_state_dict(load_file(folder / WEIGHTS))
+        weights = load_file(folder / WEIGHTS)
+        actor.load_state_dict(weights)
     except (OSError, SafetensorError, RuntimeError) as error:
-        raise CheckpointError(f"{folder / WEIGHTS}: {error}") from error
+        reason = " ".join(str(error).split())  # torch's has a line for each tensor
+        raise CheckpointError(f"{folder / WEIGHTS}: {reason}") from error
+    if not all(bool((value.abs() <= LARGEST_WEIGHT).all()) for value in weights.values()):
+        raise CheckpointError(
+            f"{folder / WEIGHTS}: a weight is not finite, or beyond ±{LARGEST_WEIGHT:g}: the training diverged, or the "
+            "file is damaged. Train again, perhaps with a lower --lr."
+        )
     return LearnedPolicy(actor)

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 Algorithm = Literal["mappo", "ippo"]
 TrainingSplit = Literal["train"]
 """The other splits are for validation and for results."""
+_OF_NETWORKS = (*("algo", "randomise", "warm_start", "envs", "decisions", "entropy", "discount_hours", "threads"),)
+"""Options of `train` for networks alone."""
 BoardSplit = Literal["test", "validation"]
 PAGE = "index.html"
 _SUBMIT = "Check a result and write the file to send"
@@ -35,6 +37,7 @@ FOLDER = Path("docs/results/leaderboard")
 
 
 def train_command(
+    ctx: typer.Context,
     scenario: str | None = argument("A library name, a .toml file or an instance of the suite; or use --suite.", None),
     *,
     given: Annotated[Given, From(PpoConfig, "warm_start", "envs", "decisions", "learning_rate", "entropy", "seed")],
@@ -51,7 +54,10 @@ def train_command(
         noun="algorithm",
     ),
     discount_hours: float = option(
-        "Time constant of the discount, h: a reward this much later counts 1/e.", 2.0, low=0.01, high=1000
+        "Time constant of the discount, h: a reward this much later counts 1/e. Not with --suite.",
+        2.0,
+        low=0.01,
+        high=1000,
     ),
     instances: int = option("With --suite: number of training instances.", 48, low=1, high=200),
     validation_instances: int = option("With --suite: number of validation instances.", 80, low=1, high=200),
@@ -64,7 +70,7 @@ def train_command(
         "start the others.",
         False,
     ),
-    threads: int = option("Threads of the network's computations.", 1, low=1, high=1024),
+    threads: int = option("Threads of the network's computations. Not with --suite.", 1, low=1, high=1024),
     randomise: list[str] | None = options.RANDOMISE,
 ) -> None:
     """Train a policy by reinforcement learning or evolution, with checkpoints and learning curves.
@@ -82,10 +88,10 @@ def train_command(
 
     if (scenario is None) == (suite is None):
         raise FleetError("Give either a scenario or --suite SPLIT.")
-    if randomise and suite is not None:
-        raise FleetError(
-            "--randomise needs a scenario: the instances of --suite are fixed. Give a scenario instead of --suite."
-        )
+    if suite is None and (needless := options.first_given(ctx, "instances", "validation_instances")):
+        raise FleetError(f"{needless} needs --suite; a scenario is one instance.")
+    if suite is not None and (needless := options.first_given(ctx, *_OF_NETWORKS)):
+        raise FleetError(f"{needless} needs a scenario: --suite trains prices of bid_price over fixed instances.")
     varied = options.parse_randomisation(randomise)
     if seeds > 1 and out is not None:
         raise FleetError(f"--seeds {seeds} trains into folders of runs/: leave --out out (got {out}).")
@@ -93,8 +99,6 @@ def train_command(
         check_folder(out)
     if suite is not None or INSTANCE.fullmatch(scenario or ""):
         choose("training split", suite or (scenario or "").partition("/")[0], TrainingSplit)
-    if suite is not None and algo is not None:
-        raise FleetError("--algo needs a scenario: --suite trains prices of bid_price.")
     from agents.learned.evolution import CURVE
     from scenarios.train.training import Trained, holds_training
 

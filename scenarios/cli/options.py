@@ -69,8 +69,7 @@ class From:
             FleetError: a text has another form.
         """
         own = {name: values.pop(name) for name in self.options}
-        sources = {name: getattr(ctx.get_parameter_source(name), "name", "") for name in own}
-        given = {name: value for name, value in own.items() if sources[name] in _GIVEN or name in self.defaults}
+        given = {name: value for name, value in own.items() if _is_given(ctx, name) or name in self.defaults}
         for name, value in given.items():
             if parse := self.options[name].parse:
                 try:
@@ -78,6 +77,15 @@ class From:
                 except ValueError as error:
                     raise FleetError(str(error)) from error
         return given
+
+
+def _is_given(ctx: typer.Context, name: str) -> bool:
+    return getattr(ctx.get_parameter_source(name), "name", "") in _GIVEN
+
+
+def first_given(ctx: typer.Context, *names: str) -> str:
+    """The first of these options that is given; "" if none is."""
+    return next((f"--{name.replace('_', '-')}" for name in names if _is_given(ctx, name)), "")
 
 
 def with_fields(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -108,8 +108,8 @@ def run(
             count, asked = len(env.events), env.may_claim or not only_when_asked
             seen = env.knowledge() if asked else {}
             with blaming(spec.policy, f"{shift}, at {env.tick * env.world.dt_s:g} s of the shift"):
-                actions = policy.act(seen) if asked else {}
-                actions_of(env.agents, actions)
+                chosen = actions_of(env.agents, policy.act(seen) if asked else {})
+            actions = dict(zip(env.agents, chosen.tolist(), strict=True))
             outcome, _, _ = env.advance(actions)
             awards = [event for event in env.events[count:] if event.kind == "award"]
             for award in awards if record else ():

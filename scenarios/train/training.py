@@ -92,7 +92,7 @@ def run_training(
         tell(f"Skipped the training in '{out}', because it is complete.")
         return Trained(search.done, _kept(out), best, before_s, interrupted=False)
     out.mkdir(parents=True, exist_ok=True)
-    log, interrupted, validated = TrainingLog(out), False, search.done
+    log, interrupted, validated = TrainingLog(out, search.done), False, search.done
     began_s = time.monotonic() - before_s  # as if the sessions had followed each other
     teacher = numbers.get("teacher", np.nan)
     if not resume:
@@ -138,7 +138,7 @@ def run_training(
 def _kept(out: Path) -> int:
     """The iteration of the saved policy: the first with the best validation."""
     rows = [row for row in read_log(out) if "validation" in row]
-    return max(rows, key=lambda row: row["validation"])["iteration"]
+    return max(rows, key=lambda row: row["validation"], default={"iteration": 0})["iteration"]
 
 
 def holds_training(out: Path) -> bool:

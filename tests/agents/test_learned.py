@@ -241,6 +241,13 @@ def test_what_is_no_policy_is_said(tmp_path) -> None:
     save_policy(Actor(), size, tmp_path)
     with pytest.raises(CheckpointError, match="size mismatch"):
         load_policy(tmp_path)
+    for wrong in (float("nan"), float("inf"), -1e30):
+        actor = Actor()
+        with torch.no_grad():
+            next(actor.parameters()).flatten()[3] = wrong
+        save_policy(actor, NetworkSize(), tmp_path)
+        with pytest.raises(CheckpointError, match="not finite, or beyond"):
+            load_policy(tmp_path)
     for text, reason in (
         ("{", "truncated"),
         ('{"format": 5, "size": {}}', "format 5 is not supported, only 6. Make it again"),

@@ -72,6 +72,19 @@ def test_the_same_seed_gives_the_same_shift_without_an_illegal_action(fleet, pol
     assert one.metrics.illegal_actions == 0
 
 
+@pytest.mark.parametrize("form", ["[{}]", "np.array([{}])", "np.int8({})"])
+def test_an_action_may_be_an_array_of_one_integer(fleet, result, tmp_path, form):
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "import numpy as np\n"
+        "from agents.rules import RoundRobin\n"
+        "class Wrapped(RoundRobin):\n"
+        "    only_choices = True\n"
+        f"    def act(self, seen): return {{arm: {form.format('a')} for arm, a in super().act(seen).items()}}\n"
+    )
+    assert same(run(fleet, spec(f"{file}:Wrapped")), result)
+
+
 def test_offers_of_arms_without_predictions_have_none(result):
     assert result.offers
     assert {(o.difficulty, o.peak_c, o.p_saturation) for o in result.offers} == {(None, None, None)}

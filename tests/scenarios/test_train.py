@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from agents.learned.config import TrainingLength
-from agents.learned.evolution import CURVE, LOG, EvolutionConfig
+from agents.learned.evolution import CURVE, LOG, EvolutionConfig, read_log
 from agents.learned.policy import load_policy
 from agents.learned.ppo import PpoConfig
 from agents.pairs import PAIRS_CARD, PARAMETERS, Prices
@@ -81,6 +81,9 @@ WRONG = {
     "--suite trian": "No training split 'trian'; did you mean 'train'?",
     "test/0017": "No training split 'test'. Allowed: train.",
     "--suite train --algo mappo": "--algo needs a scenario",
+    "--suite train --entropy 0.1": "--entropy needs a scenario",
+    "--suite train --discount-hours 2.0": "--discount-hours needs a scenario",
+    "quickstart --instances 5": "--instances needs --suite",
     "quickstart --seeds 2 --out x": "leave --out out",
     "--suite train --minutes 0": "minutes must be > 0",
 }
@@ -153,7 +156,10 @@ def test_a_training_leaves_a_central_policy_and_begins_with_its_teacher(tmp_path
         assert saved["teacher"] == teacher
         assert 0.0 < saved["seconds"] <= done.seconds
         np.savez(out / PAIRS_STATE, **{**saved, "seconds": np.array(100.0)})
+    with (out / LOG).open("a") as log:  # of a process that was killed, while it wrote
+        log.write('{"number": 3, "fitness": 1.0}\n{"number": 4, "fit')
     again = trained(3, resume=True)
+    assert [row["number"] for row in read_log(out) if "number" in row] == [1, 2, 3]
     assert again.iterations == 3
     assert again.best >= done.best
     assert again.seconds > 100.0
