@@ -291,17 +291,18 @@ def _maker_of(name: str, bus: OnBus) -> Callable[[], Policy] | Callable[[], ArmP
 
 def _made_by(name: str) -> tuple[Callable[[], Policy] | Callable[[], ArmPolicy], str]:
     """What makes the policy of a name that is no folder, and its scope."""
-    if ":" not in name:
+    if ":" not in name and not name.endswith(".py"):
         try:
             return rule_of(name).kind, rule_of(name).scope
         except ValueError as error:
             raise FleetError(f"{error} Or name your own as FILE.py:CLASS, or the folder of a trained one.") from error
-    where, _, kind = name.rpartition(":")
+    where, _, kind = name.rpartition(":") if ":" in name else (name, "", "")
     module = _module(where, name)
     found = getattr(module, kind, None)
     if not callable(found):
-        classes = [key for key, value in vars(module).items() if isinstance(value, type)]
-        raise FleetError(f"No class '{kind}' in '{where}'{nearest(kind, classes)}")
+        own = [key for key, each in vars(module).items() if getattr(each, "__module__", "") == module.__name__]
+        problem = f"No class '{kind}' in '{where}'" if kind else f"'{where}' names no class: give {where}:CLASS"
+        raise FleetError(f"{problem}{nearest(kind, own)}")
     try:
         signature(found).bind()
     except TypeError as error:

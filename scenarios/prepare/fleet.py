@@ -410,6 +410,10 @@ def open_exchange(
         raise FleetError(str(error)) from error
 
 
+_BATCHED = frozenset({"num_envs", "autoreset", "stagger", "threads"})
+"""Options of `make_batch` that one environment does not have."""
+
+
 def make_env(
     scenario: str | Path | Scenario,
     *,
@@ -454,6 +458,8 @@ def make_env(
     """
     if not isinstance(channel, Channel):
         raise ScenarioError(f"channel must be a fleet.bus.exchange.channel.Channel (got {channel!r}).")
+    if batched := sorted(_BATCHED & set(overrides)):
+        raise ScenarioError(f"make_env() takes no {batched[0]}; only make_batch() does.")
     chosen = scenario_with(scenario, overrides, make_env)
     near = near_of(chosen, peers)
     fleet = prepare(chosen, difficulty=difficulty, risk=risk, randomise=randomise, cache=cache, progress=progress)

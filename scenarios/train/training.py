@@ -172,7 +172,7 @@ def check_folder(out: Path, card: Mapping[str, Any], state: str, *, resume: bool
     was, now = (each | each.get("config", {}) | {"config": None} for each in (before, json.loads(json.dumps(card))))
     for name, value in now.items():
         if was.get(name) != value:
-            raise FleetError(f"The training in '{out}' has {name} = {was.get(name)} (got {value}).")
+            raise FleetError(f"The training in '{out}' has {name} = {was.get(name)!r} (got {value!r}).")
 
 
 def _write_card(out: Path, card: Mapping[str, Any]) -> None:

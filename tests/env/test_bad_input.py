@@ -222,6 +222,8 @@ def test_unknown_overrides_are_refused_with_the_nearest_name(cell, plans) -> Non
     for name, value in single.items():
         with pytest.raises(ScenarioError, match=rf"make_batch\(\) takes no {name}; only make_env\(\) does\."):
             make_batch(cell, 2, difficulty="blind", cache=plans, **{name: value})
+    with pytest.raises(ScenarioError, match=r"make_env\(\) takes no threads; only make_batch\(\) does\."):
+        make_env(cell, difficulty="blind", cache=plans, threads=2)
 
 
 def test_a_seed_override_and_a_batch_that_cannot_fit_are_refused_and_a_cache_may_be_a_string(cell, plans) -> None:

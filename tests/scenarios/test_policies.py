@@ -78,7 +78,11 @@ def test_an_own_class_from_a_file_or_a_module(own):
     ("name", "said"),
     [
         ("least_dificulty", "did you mean 'least_difficulty'"),
-        ("{own}:Idel", "did you mean 'Idle'"),
+        ("{own}:Idel", r"did you mean 'Idle'\? Allowed: Idle, Lone, Needy, No, Old, Unset, make\.$"),
+        (
+            "{own}",
+            r"mine.py' names no class: give .*mine.py:CLASS\. Allowed: Idle, Lone, Needy, No, Old, Unset, make\.$",
+        ),
         ("{own}:No", r"is no policy: of scope central it needs the methods reset\(rng\) and act\(observations\)"),
         ("{own}:Old", r"Old' has no valid scope \(got None\). Set in the class: scope = .central. if its act"),
         ("{own}:Needy", r"must be a class or function that is called without arguments \(missing a required argument:"),

@@ -114,7 +114,7 @@ def test_commands_refuse_what_cannot_be_randomised(thermofleet, small_toml, tmp_
         (("compare", small_toml, "--randomise", "variants=[{slots=3}]"), "a variant must keep the slots"),
         (("compare", small_toml, "--randomise", "x=1"), "--randomise has no field 'x'"),
         (("train", small_toml, "--randomise", "x=1"), "--randomise has no field 'x'"),
-        (("train", "--suite", "train", "--randomise", "ambient_k=[0,1]"), "the instances of --suite are fixed"),
+        (("train", "--suite", "train", "--randomise", "ambient_k=[0,1]"), "--randomise needs a scenario"),
     ):
         assert thermofleet(*words).refused(message)
     scenario = override(load(small_toml), ambient={"points": [[0, 55]]})
