@@ -163,11 +163,14 @@ class ConsensusNode(JobDesk):
         granter, number = self.participant.granter, self._first_number
         check_journals(self._name, number, self._epoch, histories, new_epoch=self._new_epoch)
         known = max((history.claims.get(self._name, -1) for history in histories), default=-1)
+        epochs = [history.epoch for history in histories if history.epoch]
         if known >= number or (known >= 0 and not self._epoch):
             _LOG.warning("Arm '%s' adopts what %d arm(s) have done and have.", self._name, len(histories))
             for history in (each for each in histories if each.arm != self._name):
                 granter.adopt(adopted(self.book, history), time.monotonic())
             self.participant.count_after(known)
+        if epochs and not self._epoch:
+            self._take_epoch(epochs[0])
 
     def _ask_peers(self, real_s: float) -> None:
         """Ask all peers what they know, before this arm takes or names an epoch."""
@@ -176,9 +179,11 @@ class ConsensusNode(JobDesk):
         self._asked_s = real_s
 
         def done(replies: Replies[History]) -> None:
+            histories = tuple(replies.messages.values())
             try:
-                self._join(tuple(replies.messages.values()))
-                self._joined = True
+                self._join(histories)
+                # Fewer than a majority may not know of an epoch that the others have begun.
+                self._joined = len({each.arm for each in histories} | {self._name}) >= self._majority
             except Refused as error:
                 self._warn("journal", f"cannot record what its peers know: {error}")
             except BusError as error:
@@ -219,8 +224,8 @@ class ConsensusNode(JobDesk):
         """Start the fleet's time, unless a peer has started it."""
         roster = self.participant.granter.roster
         present = len(self._tokens & roster | {self._name})
-        if present < self.participant.claimant.majority:
-            self._since_s = real_s
+        if present < self._majority:
+            self._since_s, self._joined = real_s, False  # meanwhile the others may begin an epoch
         elif real_s - self._since_s >= (LISTEN_S if present == len(roster) else PATIENCE_S):
             first = self._name == min(self._tokens & roster | {self._name})
             if not (self._epoch or self._joined):
@@ -271,6 +276,10 @@ class ConsensusNode(JobDesk):
     @property
     def _epoch(self) -> str:
         return self.book.epoch
+
+    @property
+    def _majority(self) -> int:
+        return self.participant.claimant.majority
 
     def _take_epoch(self, epoch: str) -> bool:
         """Take the epoch of the fleet, unless there is one on disk already; return whether it is this one."""

@@ -152,6 +152,18 @@ def test_a_restarted_arm_knows_its_peers_before_it_replies_for_them(bus, monkeyp
         restarted._check_first()
 
 
+def test_an_arm_that_comes_later_takes_the_epoch_of_the_others_though_it_is_the_first_by_name(bus, monkeypatch):
+    """And though it gets their replies before a bid."""
+    monkeypatch.setattr(node_module, "PATIENCE_S", 0.5)
+    for name in ROSTER[1:]:
+        bus.arm(name)
+    assert bus.serve(lambda: all(one.work_source._begun for one in bus.arms.values()))
+    monkeypatch.setattr(ConsensusNode, "_apply_bid", lambda *_: None)
+    late = bus.arm(ROSTER[0]).work_source
+    assert bus.serve(lambda: late._begun)
+    assert {one.work_source._epoch for one in bus.arms.values()} == {late._epoch}
+
+
 def settled(bus, *names):
     """Return whether every present arm knows that these jobs are finished."""
     return all(all(map(one.work_source.book.is_settled, names)) for one in bus.arms.values())
