@@ -110,9 +110,13 @@ KEYS = {
     "{keys} --add x:submiter": "did you mean 'submitter'?",
     "{keys} --add x": "is not NAME:ROLE",
     "{keys} --add ca:monitor": "cannot be named 'ca'",
-    "{keys} --extra y:arm": "SCENARIO is needed",
-    "{keys} --no-auctioneer": "SCENARIO is needed",
-    "{keys} quickstart --add y:arm": "leave SCENARIO and --extra out",
+    **{
+        f"{{keys}} {option}": f"{option.split()[0]} is for new keys. Give SCENARIO to make all keys (with --overwrite, "
+        for option in ("--extra y:arm", "--no-auctioneer", "--overwrite", "--host cell-1", "--days 9 --json")
+    },
+    "{keys} --add y:arm --host cell-1": "--host is for the certificate of a router",
+    "{keys} --add y:arm --no-auctioneer": "leave SCENARIO, --extra and --no-auctioneer out",
+    "{keys} quickstart --add y:arm": "leave SCENARIO, --extra and --no-auctioneer out",
     "{keys} quickstart --extra arm_0:arm --overwrite": "'arm_0' is taken",
     "{keys} nowhere": "No scenario 'nowhere'",
 }
