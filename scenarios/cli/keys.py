@@ -64,8 +64,8 @@ def keys_command(
         except ValueError as error:
             raise FleetError(str(error)) from error
         make(folder, roster, days=lifetime, hosts=hosts, overwrite=overwrite)
-    for one in added:
-        add_to(folder, one, days=lifetime, hosts=hosts, overwrite=overwrite)
+    if added:
+        add_to(folder, added, days=lifetime, hosts=hosts, overwrite=overwrite)
     roster = read_roster(folder)
     spans = lifetimes(folder, roster)
     if as_json:

@@ -106,6 +106,8 @@ def test_a_port_in_use_is_one_sentence(thermofleet):
 KEYS = {
     "{keys} quickstart": "holds the keys of a fleet",
     "{keys} --add gateway:submitter": "has a certificate",
+    "{keys} --add arm_0:operator": "'arm_0' has the role arm in",
+    "{keys} --add x:arm --add gateway:submitter": "has a certificate",
     "{keys} --add x:router --host 'a b'": "is not a host name or address",
     "{keys} --add x:submiter": "did you mean 'submitter'?",
     "{keys} --add x": "is not NAME:ROLE",
