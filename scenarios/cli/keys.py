@@ -32,7 +32,7 @@ def keys_command(
     as_json: bool = options.JSON,
 ) -> None:
     """Make, extend and show keys and certificates for mutual TLS."""
-    from fleet.bus.security.certificates import HERE, lifetimes, make
+    from fleet.bus.security.certificates import HERE, hosts_of, lifetimes, make, read
     from fleet.bus.security.certificates import add as add_to
 
     if add and (scenario or extra or no_auctioneer):
@@ -74,6 +74,10 @@ def keys_command(
     out_console.print(_table(roster, spans))
     if scenario or add:
         say(f"Keys of the fleet '{roster.fleet}' are in {folder}. Keep {folder / 'ca.key'} where no participant runs.")
+    for one in roster.participants if scenario else added:
+        if one.role == "router":
+            valid = ", ".join(hosts_of(read(folder, one.file)))
+            say(f"The certificate of the router '{one.name}' is valid only for {valid}; --host adds others.")
 
 
 def participant_of(text: str) -> RosterEntry:

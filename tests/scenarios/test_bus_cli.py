@@ -192,6 +192,16 @@ def test_keys_are_made_shown_and_extended(thermofleet, folder):
     assert "(authority)" in out
 
 
+def test_the_hosts_of_a_new_certificate_of_a_router_are_named(thermofleet, folder):
+    renew = ("bus", "keys", folder, "--add", "router:router", "--overwrite")
+    for hosts, named in ((["cell-1", "10.0.0.7"], ", cell-1, 10.0.0.7"), ([], "")):
+        code, _, err = thermofleet(*renew, *(word for host in hosts for word in ("--host", host)))
+        assert code == 0
+        valid = f"'router' is valid only for localhost, 127.0.0.1, ::1{named}; --host adds others."
+        assert valid in " ".join(err.split())
+    assert "valid only for" not in thermofleet("bus", "keys", folder, "--add", "x:arm")[2]
+
+
 def test_up_gives_every_process_its_own_certificate_and_the_router_here_or_elsewhere(folder):
     spec = LiveSpec(fleet="quickstart", speed=60.0, jobs="none", difficulty="blind")
     options = {"port": 7447, "folder": Path("run"), "tls": folder}

@@ -163,6 +163,15 @@ def common_name(certificate: x509.Certificate) -> str:
     return str(names[0].value) if names else ""
 
 
+def hosts_of(certificate: x509.Certificate) -> list[str]:
+    """Names and addresses of the machine for which a router's certificate is valid; none of another certificate."""
+    try:
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return []
+    return [str(name.value) for name in names]
+
+
 def format_time(moment: datetime) -> str:
     """As `2026-11-21 15:00 UTC`."""
     return f"{moment:%Y-%m-%d %H:%M} UTC"
