@@ -204,6 +204,7 @@ def read_tokens(path: Path) -> dict[str, Role]:
     except (OSError, UnicodeDecodeError) as error:
         raise FleetError(f"Cannot read the tokens in '{path}': {error}.") from error
     tokens: dict[str, Role] = {}
+    first = dict[str, int]()
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.startswith("#"):
             continue
@@ -211,7 +212,12 @@ def read_tokens(path: Path) -> dict[str, Role]:
         role: Role | None = next((role for role in ROLES if role == name), None)
         if role is None:
             raise FleetError(f"{path}, line {number}: no role '{name}'{nearest(name, ROLES)}")
-        tokens[check_token(token.strip())] = role
+        token = check_token(token.strip())
+        if token in tokens:
+            raise FleetError(
+                f"{path}, lines {first[token]} and {number}: the same token. Write a token in one line only."
+            )
+        tokens[token], first[token] = role, number
     if not tokens:
         raise FleetError(f"'{path}' has no tokens. Write ROLE TOKEN in each line; roles: {', '.join(ROLES)}.")
     return tokens
@@ -625,7 +631,12 @@ def run_gateway(
     hooks = webhooks_of(webhooks)
     roles = read_tokens(tokens) if tokens else {}
     if token:
-        roles[check_token(token)] = "operator"
+        if roles.get(check_token(token), "operator") != "operator":
+            raise FleetError(
+                f"--token ({TOKEN}) is a token of the role {roles[token]} in '{tokens}', and it would be one of the "
+                "role operator. Give another one."
+            )
+        roles[token] = "operator"
     check(host, endpoint, bool(roles))
     name = the_fleet(fleet, endpoint)
     with listen(host, port) as bound:

@@ -28,7 +28,7 @@ from fleet.live.arm.awards import ArmRecord, Closed
 from fleet.live.journal import Journal
 from scenarios.cli.main import main
 from scenarios.live.fleet_processes import chosen_arms, free_port, parts_of
-from scenarios.live.gateway import check, check_token, read_tokens
+from scenarios.live.gateway import check, check_token, read_tokens, run_gateway
 from scenarios.spec.options import LiveSpec
 from tests import commands
 from tests.waiting import PATIENCE_S, wait_until
@@ -317,6 +317,7 @@ def test_a_missing_extra_is_named(thermofleet, monkeypatch):
     assert thermofleet("bus", "ros2", "bridge", "--fleet", "f", "--domain", "0").refused("pip install -e '.[ros2]'")
 
 
+TOKEN = "sixteen-or-more-characters"
 PLAIN, SECURE = "tcp/127.0.0.1:7447", "tls/127.0.0.1:7447"
 
 
@@ -345,14 +346,25 @@ def test_with_a_token_any_address_is_allowed_with_a_warning(caplog):
         ("operator sixteen-or-more-characters", 0o644, "chmod 600"),
         ("operater sixteen-or-more-characters", 0o600, "line 1: no role 'operater'; did you mean 'operator'?"),
         ("# nothing", 0o600, "has no tokens"),
+        (f"monitor {TOKEN}\n\noperator  {TOKEN}", 0o600, "tokens, lines 1 and 3: the same token."),
     ],
 )
 def test_a_file_of_tokens_says_what_is_wrong_with_it(tmp_path, content, mode, says):
     path = tmp_path / "tokens"
     path.write_text(content)
     path.chmod(mode)
-    with pytest.raises(FleetError, match=re.escape(says)):
+    with pytest.raises(FleetError, match=re.escape(says)) as error:
         read_tokens(path)
+    assert TOKEN not in str(error.value)
+
+
+def test_a_token_of_a_file_is_not_an_operator_s_as_well(tmp_path):
+    path = tmp_path / "tokens"
+    path.touch(0o600)
+    path.write_text(f"monitor {TOKEN}")
+    with pytest.raises(FleetError, match="is a token of the role monitor in") as error:
+        run_gateway(PLAIN, "f", 0, "localhost", TOKEN, path)
+    assert TOKEN not in str(error.value)
 
 
 def test_a_token_is_long_and_ascii():
