@@ -46,7 +46,7 @@ from fleet.bus.router import Router
 from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import issue, make
 from fleet.bus.security.tls import Tls
-from fleet.errors import BusError
+from fleet.errors import BusError, FleetError
 from scenarios.cli.main import app
 from scenarios.live import requests
 from tests import commands
@@ -164,14 +164,24 @@ def test_the_gateway_submits_with_the_certificate_of_a_submitter(fleet):
         assert (code, [arm["arm"] for arm in told["arms"]]) == (200, [ARM])
 
 
-def test_the_gateway_reports_that_a_monitor_may_not_submit(fleet):
+def test_a_gateway_with_the_certificate_of_a_monitor_has_requests_of_a_monitor_only(fleet, tmp_path):
     with gateway(fleet, "monitor") as port:
+        assert asked(port, "GET", "/")[1]["role"] == "monitor"
         assert asked(port, "GET", "/v4/jobs?job=j")[0] == 200
         for path in ("/v4/jobs", "/v4/ask"):
             code, told = asked(port, "POST", path, JOBS)
-            assert code == 503
-            assert "'monitor:monitor' may not query" in told["detail"]
-            assert "takes a certificate of the role" in told["detail"]
+            assert code == 403
+            assert told["detail"] == "This token has the role monitor; this request needs submitter."
+    tokens = tmp_path / "tokens"
+    tokens.touch(0o600)
+    tokens.write_text("operator another-token-of-this-test")
+    done = CliRunner().invoke(
+        app, ["bus", "gateway", "--endpoint", fleet.endpoint("monitor"), "--port", "0", "--tokens", str(tokens)]
+    )
+    with pytest.raises(
+        FleetError, match=r"'monitor:monitor' does not permit .* Use a certificate of the role operator"
+    ):
+        raise done.exception
 
 
 def test_an_error_of_tls_is_one_sentence(fleet):

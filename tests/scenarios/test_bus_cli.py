@@ -28,7 +28,7 @@ from fleet.live.arm.awards import ArmRecord, Closed
 from fleet.live.journal import Journal
 from scenarios.cli.main import main
 from scenarios.live.fleet_processes import chosen_arms, free_port, parts_of
-from scenarios.live.gateway import check, check_token, read_tokens, run_gateway
+from scenarios.live.gateway import ROLES, check, check_token, permitted_role, read_tokens, run_gateway
 from scenarios.spec.options import LiveSpec
 from tests import commands
 from tests.waiting import PATIENCE_S, wait_until
@@ -362,9 +362,36 @@ def test_a_token_of_a_file_is_not_an_operator_s_as_well(tmp_path):
     path = tmp_path / "tokens"
     path.touch(0o600)
     path.write_text(f"monitor {TOKEN}")
-    with pytest.raises(FleetError, match="is a token of the role monitor in") as error:
+    with pytest.raises(FleetError, match="is also a token of") as error:
         run_gateway(PLAIN, "f", 0, "localhost", TOKEN, path)
     assert TOKEN not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("role", "permits"),
+    {
+        "operator": "operator",
+        "submitter": "submitter",
+        "monitor": "monitor",
+        "recorder": "monitor",
+        "arm": "",
+        "auctioneer": "",
+        "policy": "",
+    }.items(),
+)
+def test_tokens_give_no_more_than_the_certificate(role, permits):
+    entry = RosterEntry("a", role)
+    allowed = ROLES[: ROLES.index(permits) + 1] if permits else ()
+    for number, token in enumerate(ROLES):
+        if token in allowed:
+            assert permitted_role("f", entry, {"t" * 16: token}) == permits
+            continue
+        refusal = f"'{role}:a' does not permit the requests of a token of the role {token}. Use a certificate of the "
+        needed = re.escape(f"{refusal}role {' or '.join(ROLES[number:])}, ")
+        with pytest.raises(FleetError, match=needed):
+            permitted_role("f", entry, {"t" * 16: token, "m" * 16: "monitor"})
+    if permits:
+        assert permitted_role("f", entry, {}) == permits
 
 
 def test_a_token_is_long_and_ascii():
