@@ -47,6 +47,8 @@ from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import issue, make
 from fleet.bus.security.tls import Tls
 from fleet.errors import BusError, FleetError
+from fleet.live import job_client
+from scenarios.cli import jobs
 from scenarios.cli.main import app
 from scenarios.live import requests
 from tests import commands
@@ -206,12 +208,21 @@ def test_the_doctor_mentions_a_certificate_unknown_to_the_router(fleet, tmp_path
     assert "the router does not know this certificate" in " ".join(done.stdout.split())
 
 
-@pytest.mark.parametrize("command", [("arm", "pause"), ("arm", "clear", ARM), ("arm", "reset", ARM)], ids=" ".join)
+@pytest.mark.parametrize(
+    "command",
+    [
+        *(("arm", *words, "--by", "ann") for words in (("pause",), ("clear", ARM), ("reset", ARM))),
+        ("job", "list"),
+        *(("job", "submit", "--kind", "hold", "--place", "rack", *words) for words in ((), ("--quote",))),
+    ],
+    ids=" ".join,
+)
 def test_a_request_without_a_reply_mentions_the_roster(fleet, tmp_path, monkeypatch, command):
-    monkeypatch.setattr(requests, "REPLY_S", 0.5)
+    for module, seconds in ((requests, "REPLY_S"), (job_client, "REPLY_S"), (jobs, "LISTEN_S")):
+        monkeypatch.setattr(module, seconds, 0.5)
     endpoint = issue_later(fleet, tmp_path / "k", RosterEntry("ann", "operator"))
-    done = CliRunner().invoke(app, [*command, "--by", "ann", "--endpoint", endpoint, "--fleet", "f"])
-    assert isinstance(done.exception, BusError)
+    done = CliRunner().invoke(app, [*command, "--endpoint", endpoint, "--fleet", "f"])
+    assert isinstance(done.exception, FleetError)
     assert "it reads its roster when it starts" in str(done.exception)
 
 
