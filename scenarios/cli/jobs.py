@@ -109,6 +109,7 @@ def list_command(
     from fleet.bus.client import BusClient, NoReply
     from fleet.bus.protocol import keys
     from fleet.bus.protocol.auction import ABANDONED, SETTLED, Status, StatusRequest
+    from fleet.bus.security.tls import unknown_certificate_hint
     from fleet.live.job_rules import waits_since_s
     from fleet.live.monitor.snapshot import FleetListener
     from scenarios.cli.options import the_fleet
@@ -127,7 +128,8 @@ def list_command(
             now_s = max(now_s, now.time_s)
         except (NoReply, Refused) as error:
             if not known:
-                raise FleetError(f"Nobody tells of jobs: {error}") from error
+                hint = unknown_certificate_hint(endpoint) if isinstance(error, NoReply) else ""
+                raise FleetError(f"Nobody tells of jobs: {error}{hint}") from error
             say(f"These are the last known changes: {error}", err_console)
     jobs = sorted(known.values(), key=lambda status: status.job)
     if unknown := sorted({*(names or ())} - {job.job for job in jobs}):

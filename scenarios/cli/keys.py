@@ -23,24 +23,37 @@ def keys_command(
     ),
     extra: list[str] | None = option(f"NAME:ROLE, another participant; roles: {_ROLES}.", None),
     add: list[str] | None = option("NAME:ROLE, a new certificate from the present authority.", None),
-    days: int = option("Lifetime of the participants' certificates, days.", DAYS, low=1, high=MAX_DAYS),
+    days: int | None = option(f"Lifetime of the new certificates, days. Default: {DAYS}.", None, low=1, high=MAX_DAYS),
     host: list[str] | None = option(
         "Name or address of the router, besides localhost, 127.0.0.1 and ::1; may be repeated.", None
     ),
-    overwrite: bool = option("Replace all keys; with --add, replace one certificate.", False),
+    overwrite: bool = option("With SCENARIO, replace all keys; with --add, replace certificates.", False),
     no_auctioneer: bool = option("Rights for arms that allocate jobs by consensus, without an auctioneer.", False),
     as_json: bool = options.JSON,
 ) -> None:
     """Make, extend and show keys and certificates for mutual TLS."""
-    from fleet.bus.security.certificates import HERE, lifetimes, make
+    from fleet.bus.security.certificates import HERE, hosts_of, lifetimes, make, read
     from fleet.bus.security.certificates import add as add_to
 
-    if add and (scenario or extra):
-        raise FleetError("--add extends the present keys; leave SCENARIO and --extra out.")
-    if no_auctioneer and not scenario:
-        raise FleetError("--no-auctioneer is for new keys, so SCENARIO is needed.")
-    if extra and not scenario:
-        raise FleetError("--extra is for new keys, so SCENARIO is needed; --add extends present ones.")
+    if add and (scenario or extra or no_auctioneer):
+        raise FleetError("--add extends the present keys; leave SCENARIO, --extra and --no-auctioneer out.")
+    if not (scenario or add):
+        for_new_keys = {
+            "--extra": extra,
+            "--days": days,
+            "--host": host,
+            "--overwrite": overwrite,
+            "--no-auctioneer": no_auctioneer,
+        }
+        if given := [flag for flag, value in for_new_keys.items() if value]:
+            raise FleetError(
+                f"{given[0]} is for new keys. Give SCENARIO to make all keys (with --overwrite, to replace all), or "
+                "--add NAME:ROLE to extend the present ones."
+            )
+    added = [participant_of(text) for text in add or ()]
+    if host and added and not any(one.role == "router" for one in added):
+        raise FleetError("--host is for the certificate of a router, and --add names none; leave --host out.")
+    lifetime, hosts = days or DAYS, host or HERE
     if scenario:
         from scenarios.spec.load import load
 
@@ -50,9 +63,9 @@ def keys_command(
             roster = of_arms(chosen.name, [arm.name for arm in chosen.arms], more, auctioneer=not no_auctioneer)
         except ValueError as error:
             raise FleetError(str(error)) from error
-        make(folder, roster, days=days, hosts=host or HERE, overwrite=overwrite)
-    for text in add or ():
-        add_to(folder, participant_of(text), days=days, hosts=host or HERE, overwrite=overwrite)
+        make(folder, roster, days=lifetime, hosts=hosts, overwrite=overwrite)
+    if added:
+        add_to(folder, added, days=lifetime, hosts=hosts, overwrite=overwrite)
     roster = read_roster(folder)
     spans = lifetimes(folder, roster)
     if as_json:
@@ -61,6 +74,10 @@ def keys_command(
     out_console.print(_table(roster, spans))
     if scenario or add:
         say(f"Keys of the fleet '{roster.fleet}' are in {folder}. Keep {folder / 'ca.key'} where no participant runs.")
+    for one in roster.participants if scenario else added:
+        if one.role == "router":
+            valid = ", ".join(hosts_of(read(folder, one.file)))
+            say(f"The certificate of the router '{one.name}' is valid only for {valid}; --host adds others.")
 
 
 def participant_of(text: str) -> RosterEntry:

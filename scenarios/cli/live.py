@@ -259,13 +259,14 @@ def gateway_command(
     port: int = option("TCP port of the gateway; 0 is any free one.", PAGE_PORT, low=0, high=65535),
     host: str = option("Listening address; beyond loopback only with a token.", "127.0.0.1"),
     token: str = option(
-        "Bearer token for all requests. Prefer the variable: other users can read command lines.",
+        "Bearer token for all requests, with TLS for those that the certificate permits. Prefer the variable: other "
+        "users can read command lines.",
         "",
         env="THERMOFLEET_TOKEN",
     ),
     tokens: Path | None = option(
         "File with ROLE TOKEN in each line, readable by you alone. Roles: monitor, submitter, operator; each "
-        "may do what the ones before it may.",
+        "may do what the ones before it may. With TLS the certificate must permit it.",
         None,
     ),
     recording: Path | None = option("Recording of the fleet, whose alarms the gateway continues.", None),

@@ -369,7 +369,7 @@ def report_command(
     ),
     out: Path | None = option(
         "The HTML file; of several runs also their table of figures, .csv or .xlsx. Default: report.html in the folder "
-        "of a run and beside that of a recording, compared.html beside several runs.",
+        "of the run or recording, compared.html beside several runs.",
         None,
     ),
     scenario: str | None = option("Of a recording: scenario of the fleet, if no auctioneer described its cell.", None),
@@ -411,11 +411,10 @@ def report_command(
         print_either(as_json, thread.as_json(), thread_table(thread))
         return
     if (folder / "run.json").exists():
-        path, run = out or folder / "report.html", open_run(folder)
-        html = run.page(meshes=meshes)
+        html = open_run(folder).page(meshes=meshes)
     else:
-        path = out or folder.parent / "report.html"
         html = open_recording(folder, None if scenario is None else load(scenario)).page()
+    path = out or folder / "report.html"
     with new_file(path) as draft:
         draft.write_text(html, encoding="utf-8")
     say(f"Open {path} in a browser.", out_console)

@@ -57,6 +57,8 @@ from fleet.bus.protocol.operator import (
     ResetReply,
     ResetRequest,
 )
+from fleet.bus.security.access_control import RosterEntry, rights_by_role
+from fleet.bus.security.tls import participant_at
 from fleet.env.render.heat import heat_scale
 from fleet.errors import NAME_RULE, BusError, FleetError, Refused, ScenarioError, is_name, listed, nearest
 from fleet.live.job_client import batches
@@ -204,6 +206,7 @@ def read_tokens(path: Path) -> dict[str, Role]:
     except (OSError, UnicodeDecodeError) as error:
         raise FleetError(f"Cannot read the tokens in '{path}': {error}.") from error
     tokens: dict[str, Role] = {}
+    first = dict[str, int]()
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.startswith("#"):
             continue
@@ -211,7 +214,12 @@ def read_tokens(path: Path) -> dict[str, Role]:
         role: Role | None = next((role for role in ROLES if role == name), None)
         if role is None:
             raise FleetError(f"{path}, line {number}: no role '{name}'{nearest(name, ROLES)}")
-        tokens[check_token(token.strip())] = role
+        token = check_token(token.strip())
+        if token in tokens:
+            raise FleetError(
+                f"{path}, lines {first[token]} and {number}: the same token. Write a token in one line only."
+            )
+        tokens[token], first[token] = role, number
     if not tokens:
         raise FleetError(f"'{path}' has no tokens. Write ROLE TOKEN in each line; roles: {', '.join(ROLES)}.")
     return tokens
@@ -624,10 +632,13 @@ def run_gateway(
             _LOG.error("The alarms of the recording are not continued: %s", error)
     hooks = webhooks_of(webhooks)
     roles = read_tokens(tokens) if tokens else {}
-    if token:
-        roles[check_token(token)] = "operator"
-    check(host, endpoint, bool(roles))
+    if token and check_token(token) in roles:
+        raise FleetError(f"--token ({TOKEN}) is also a token of '{tokens}'. Give another one, or leave it out.")
+    check(host, endpoint, bool(roles or token))
     name = the_fleet(fleet, endpoint)
+    permitted = permitted_role(name, participant_at(endpoint), roles)
+    if token:
+        roles[token] = permitted
     with listen(host, port) as bound:
         with until_stopped() as stop:
             link = BusClient(endpoint, name, stopped=stop.is_set).open()
@@ -635,6 +646,28 @@ def run_gateway(
             number = asyncio.run(serve(link, bound, roles, page, kept=kept, hooks=hooks))
     if number == signal.SIGINT:
         raise Interrupted("The gateway was interrupted.")
+
+
+def permitted_role(fleet: str, participant: RosterEntry | None, tokens: Mapping[str, Role]) -> Role:
+    """Highest role whose requests the certificate of the gateway permits; operator without a certificate.
+
+    Raises:
+        FleetError: it is lower than the role of a token, or the certificate permits not even the requests of a monitor.
+    """
+    if participant is None:
+        return "operator"
+    needed = max(tokens.values(), key=ROLES.index, default=ROLES[0])
+    rights = rights_by_role(fleet, participant.name)
+    queries = {role: set(rights[role].queries) for role in ROLES}
+    roles: list[Role] = [role for role in ROLES if queries[role] <= set(rights[participant.role].queries)]
+    if needed not in roles:
+        allowed = " or ".join(role for role in ROLES if queries[needed] <= queries[role])
+        remedy = f"or give no token of a role above {roles[-1]}" if roles else "as --endpoint tls/HOST:PORT#DIR/NAME"
+        raise FleetError(
+            f"The certificate '{participant.common_name}' does not permit the requests of a token of the role "
+            f"{needed}. Use a certificate of the role {allowed}, {remedy}."
+        )
+    return roles[-1]
 
 
 def check(host: str, endpoint: str, has_tokens: bool) -> None:

@@ -16,7 +16,7 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "jobs": ("gauge", "Jobs by state, of those that the gateway keeps."),
     "job_changes_total": (
         "counter",
-        "Changes of jobs to a state since the gateway began, as an auctioneer publishes them.",
+        "Changes of jobs to a state, as an auctioneer publishes them, cached ones included.",
     ),
     "waiting_jobs": ("gauge", "Waiting jobs by class of reason."),
     "oldest_waiting_seconds": (
@@ -26,7 +26,7 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "bids": ("gauge", "Open jobs for which an arm has a bid."),
     "arm_events_total": (
         "counter",
-        "Events of an arm by kind, such as award, finish and fault, since the gateway began.",
+        "Events of an arm by kind, such as award, finish and fault, cached ones included.",
     ),
     "motor_temperature_celsius": ("gauge", "Temperature of a motor."),
     "headroom_kelvin": ("gauge", "From the hottest motor of an arm to its warning limit."),

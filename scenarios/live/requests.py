@@ -38,6 +38,7 @@ from fleet.bus.protocol.operator import (
     ResetRequest,
     Resume,
 )
+from fleet.bus.security.tls import unknown_certificate_hint
 from fleet.errors import BusError, FleetError, Refused, nearest
 from fleet.job import BOUNDS, KINDS
 from fleet.live.job_client import JobClient
@@ -101,6 +102,7 @@ def submit_jobs(
             raise BusError(
                 f"No auctioneer of fleet '{link.fleet}' replied. Is `thermofleet bus auctioneer` running? Arms that "
                 "allocate by consensus reply once all are present, or a majority has been for 20 s."
+                f"{unknown_certificate_hint(endpoint)}"
             ) from error
         for admission in admissions:
             decision = "accepted" if admission.accepted else "refused"
@@ -139,7 +141,8 @@ def quote_jobs(jobs: Sequence[JobSpec], endpoint: str, fleet: str, *, timeout_s:
         name = link.fleet
     quotes = {quote.arm: quote for quote in sorted(answers.messages.values(), key=lambda quote: quote.arm)}
     if not quotes and not answers.refused:
-        raise BusError(f"No arm of fleet '{name}' replied. Is `thermofleet arm run` running?")
+        hint = unknown_certificate_hint(endpoint)
+        raise BusError(f"No arm of fleet '{name}' replied. Is `thermofleet arm run` running?{hint}")
     print_either(as_json, list(quotes.values()), quote_table(jobs, quotes))
     for reason in answers.refused.values():
         say(f"Refused: {reason}" if reason else f"An arm did not reply within {timeout_s:g} s.")

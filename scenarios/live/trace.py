@@ -2,7 +2,7 @@
 
 import re
 from bisect import bisect
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from difflib import get_close_matches
 from math import isfinite
@@ -68,15 +68,18 @@ def thread_of(folder: Path, asked: str) -> Thread:
         FleetError: no run or recording, or no such event.
     """
     log: ShiftLog
+    results: Sequence[Mapping[str, Any]] = ()
     if (folder / "run.json").exists():
         log = open_run(folder)
         events, jobs = log.events, {record.job: asdict(record) for record in log.jobs}
     elif (folder / CARD).exists():
         log = open_recording(folder)
-        events, jobs = tuple(sorted(log.events, key=lambda event: event.time_s)), _recorded_jobs(folder)
+        events = tuple(sorted(log.events, key=lambda event: event.time_s))
+        results = read_parts(folder, "results").to_pylist()
+        jobs = _recorded_jobs(results)
     else:
         raise FleetError(f"'{folder}' is neither a folder of `thermofleet run` nor of `thermofleet bus record`.")
-    rows = rows_of(events, asked)
+    rows = rows_of(events, asked, {notice.kind for notice in log.notices})
     event = events[rows[0]]
     work = log.plan.at(event.arm, event.time_s)
     job = event.job or (work.job if work else "")
@@ -92,7 +95,7 @@ def thread_of(folder: Path, asked: str) -> Thread:
         row=rows[0],
         alike=tuple(rows),
         event=replace(event, job=job),
-        job=jobs.get(job, {}),
+        job=jobs.get(job, {}) | _recorded_award(results, award),
         award=award,
         offers=() if award is None else log.offers_behind(award.job, award.arm, award.time_s),
         history=history,
@@ -102,22 +105,33 @@ def thread_of(folder: Path, asked: str) -> Thread:
     )
 
 
-def _recorded_jobs(folder: Path) -> dict[str, dict[str, Any]]:
-    """Last state and last award of each job of a recording."""
-    jobs: dict[str, dict[str, Any]] = {}
-    for row in read_parts(folder, "results").to_pylist():
-        job = jobs.setdefault(row["job"], {})
-        job |= {
-            name: row[name]
-            for name in ("job", "state", "release_s", "due_s", "finished_s", "value", "cycles", "repetitions")
-        }
-        if row["award"]:
-            job |= {name: row[name] for name in ("award", "auctioneer", "difficulty", "p_saturation", "peak_c")}
-    return jobs
+def _recorded_jobs(results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Last state of each job of a recording, by name."""
+    names = ("job", "state", "release_s", "due_s", "finished_s", "value", "cycles", "repetitions")
+    return {row["job"]: {name: row[name] for name in names} for row in results}
 
 
-def rows_of(events: Sequence[Event], asked: str) -> list[int]:
+def _recorded_award(results: Sequence[Mapping[str, Any]], award: Event | None) -> dict[str, Any]:
+    """Identifier and figures of an award of a recording, as its auctioneer published them; empty if it did not.
+
+    Its time is that of another clock, so of all awards of the job to the arm the nearest is meant.
+    """
+    if award is None:
+        return {}
+    first = dict[str, Mapping[str, Any]]()
+    for row in results:
+        if row["award"] and (row["job"], row["arm"]) == (award.job, award.arm):
+            first.setdefault(row["award"], row)
+    nearest = min(first.values(), key=lambda row: abs(row["time_s"] - award.time_s), default=None)
+    names = ("award", "auctioneer", "difficulty", "p_saturation", "peak_c")
+    return {} if nearest is None else {name: nearest[name] for name in names}
+
+
+def rows_of(events: Sequence[Event], asked: str, untraced: Collection[str] = ()) -> list[int]:
     """Rows of the events that are asked for, as in `thread_of`; at least one.
+
+    Args:
+        untraced: Kinds of requests and alarms in the report.
 
     Raises:
         FleetError: no such event.
@@ -135,9 +149,14 @@ def rows_of(events: Sequence[Event], asked: str) -> list[int]:
     elif kind not in EVENT_KINDS:
         close = get_close_matches(asked, [*EVENT_KINDS, *jobs], n=1)
         kinds = ", ".join(dict.fromkeys(event.kind for event in events))
+        if kind in untraced:
+            raise FleetError(
+                f"'{kind}' is a request or an alarm, which has no causes to trace: the report names who or what caused "
+                f"it. Recorded kinds of events to trace: {kinds}."
+            )
         hint = f"; did you mean '{close[0]}'?" if close else "."
         raise FleetError(
-            f"No row, kind of event or job '{asked}'{hint} Kinds that were recorded: {kinds}. Rows: 0 to "
+            f"No row, kind of event or job '{asked}'{hint} Recorded kinds of events: {kinds}. Rows: 0 to "
             f"{len(events) - 1}."
         )
     rows = [i for i, e in enumerate(events) if e.kind == kind and name in ("", e.arm, e.job)]

@@ -300,10 +300,10 @@ def test_adding_that_breaks_off_leaves_a_folder_that_can_be_added_to(tmp_path, n
     place = tmp_path / "k"
     make(place, of_arms("f", ["a"]), days=3)
     with breaking("replace", nth):
-        add(place, RosterEntry("b", "arm"), days=3)
+        add(place, [RosterEntry("b", "arm")], days=3)
     assert read_roster(place) == of_arms("f", ["a"])
     assert not [name for name in contents(place) if name.endswith(".tmp")]
-    add(place, RosterEntry("b", "arm"), days=3)
+    add(place, [RosterEntry("b", "arm")], days=3)
     check(place, "b")
     assert read_roster(place).named("b") == RosterEntry("b", "arm")
 
@@ -312,19 +312,40 @@ def test_one_is_added_by_the_same_authority_once(tmp_path):
     place = tmp_path / "k"
     make(place, of_arms("f", ["a"]), days=3)
     before = contents(place)
-    add(place, RosterEntry("gateway", "submitter"), days=3)
+    add(place, [RosterEntry("gateway", "submitter")], days=3)
     check(place, "gateway")
     after = contents(place)
     assert {name for name in after if after[name] != before.get(name)} == {"gateway.pem", "gateway.key", ROSTER}
     with pytest.raises(BusError, match="'gateway' has a certificate"):
-        add(place, RosterEntry("gateway", "submitter"), days=3)
-    with pytest.raises(BusError, match=r"has the role submitter in .* not monitor"):
-        add(place, RosterEntry("gateway", "monitor"), days=3, overwrite=True)
+        add(place, [RosterEntry("gateway", "submitter")], days=3)
+    for overwrite in (False, True):
+        with pytest.raises(BusError, match=r"has the role submitter in .* not monitor\. Choose another name"):
+            add(place, [RosterEntry("gateway", "monitor")], days=3, overwrite=overwrite)
     with pytest.raises(BusError, match="'GATEWAY' is taken"):
-        add(place, RosterEntry("GATEWAY", "monitor"), days=3)
-    add(place, RosterEntry("gateway", "submitter"), days=3, overwrite=True)
+        add(place, [RosterEntry("GATEWAY", "monitor")], days=3)
+    add(place, [RosterEntry("gateway", "submitter")], days=3, overwrite=True)
     assert contents(place)["gateway.pem"] != after["gateway.pem"]
     check(place, "gateway")
+
+
+@pytest.mark.parametrize(
+    ("second", "complaint"),
+    [
+        (RosterEntry("a", "operator"), "has the role arm"),
+        (RosterEntry("B", "monitor"), "'B' is taken"),
+        (RosterEntry("hall", "router"), "'a b' is not a host name"),
+    ],
+)
+def test_all_are_added_or_none(tmp_path, second, complaint):
+    place, first = tmp_path / "k", RosterEntry("b", "arm")
+    make(place, of_arms("f", ["a"]), days=3)
+    before = contents(place)
+    for entries in ([first, second], [RosterEntry("a", "arm"), first, second]):
+        with pytest.raises(BusError, match=complaint):
+            add(place, entries, days=3, hosts=["a b"], overwrite=True)
+        assert contents(place) == before
+    add(place, [first, first, RosterEntry("c", "arm")], days=3)
+    assert read_roster(place) == of_arms("f", ["a", "b", "c"])
 
 
 def test_without_the_key_of_the_authority_nobody_is_added(tmp_path):
@@ -332,7 +353,7 @@ def test_without_the_key_of_the_authority_nobody_is_added(tmp_path):
     make(place, of_arms("f", ["a"]), days=3)
     (place / "ca.key").unlink()
     with pytest.raises(BusError, match=r"There is no '.*ca\.key'"):
-        add(place, RosterEntry("b", "arm"), days=3)
+        add(place, [RosterEntry("b", "arm")], days=3)
     assert read_roster(place) == of_arms("f", ["a"])
 
 

@@ -718,13 +718,16 @@ def test_a_possible_log_is_left_as_it_is():
     assert schedule(order_events(LOG, ()), ARMS, 100.0) == schedule(LOG, ARMS, 100.0)
 
 
-def test_the_command_writes_the_page_beside_the_recording(tmp_path, capsys):
-    recorder = record_events(tmp_path / "r", LOG)
-    recorder.write()  # still going on
-    with pytest.raises(SystemExit) as code:
-        main(["report", str(tmp_path / "r")])
-    assert code.value.code == 0
-    assert "live recording" in (tmp_path / "report.html").read_text(encoding="utf-8")
+def test_the_command_writes_the_page_into_the_recording_which_continues(tmp_path, capsys):
+    for name in ("r", "s"):
+        recorder = record_events(tmp_path / name, LOG)
+        recorder.write()  # still going on
+        with pytest.raises(SystemExit) as code:
+            main(["report", str(tmp_path / name)])
+        assert code.value.code == 0
+        assert "live recording" in (tmp_path / name / "report.html").read_text(encoding="utf-8")
+        assert Recorder.open(tmp_path / name, recorder.fleet).parts == recorder.parts
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["r", "s"]
     (tmp_path / "empty").mkdir()
     Recorder.open(tmp_path / "empty", "f")
     with pytest.raises(FleetError, match="no state of an arm"):

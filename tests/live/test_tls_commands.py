@@ -46,7 +46,9 @@ from fleet.bus.router import Router
 from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import issue, make
 from fleet.bus.security.tls import Tls
-from fleet.errors import BusError
+from fleet.errors import BusError, FleetError
+from fleet.live import job_client
+from scenarios.cli import jobs
 from scenarios.cli.main import app
 from scenarios.live import requests
 from tests import commands
@@ -164,14 +166,24 @@ def test_the_gateway_submits_with_the_certificate_of_a_submitter(fleet):
         assert (code, [arm["arm"] for arm in told["arms"]]) == (200, [ARM])
 
 
-def test_the_gateway_reports_that_a_monitor_may_not_submit(fleet):
+def test_a_gateway_with_the_certificate_of_a_monitor_has_requests_of_a_monitor_only(fleet, tmp_path):
     with gateway(fleet, "monitor") as port:
+        assert asked(port, "GET", "/")[1]["role"] == "monitor"
         assert asked(port, "GET", "/v4/jobs?job=j")[0] == 200
         for path in ("/v4/jobs", "/v4/ask"):
             code, told = asked(port, "POST", path, JOBS)
-            assert code == 503
-            assert "'monitor:monitor' may not query" in told["detail"]
-            assert "takes a certificate of the role" in told["detail"]
+            assert code == 403
+            assert told["detail"] == "This token has the role monitor; this request needs submitter."
+    tokens = tmp_path / "tokens"
+    tokens.touch(0o600)
+    tokens.write_text("operator another-token-of-this-test")
+    done = CliRunner().invoke(
+        app, ["bus", "gateway", "--endpoint", fleet.endpoint("monitor"), "--port", "0", "--tokens", str(tokens)]
+    )
+    with pytest.raises(
+        FleetError, match=r"'monitor:monitor' does not permit .* Use a certificate of the role operator"
+    ):
+        raise done.exception
 
 
 def test_an_error_of_tls_is_one_sentence(fleet):
@@ -196,12 +208,21 @@ def test_the_doctor_mentions_a_certificate_unknown_to_the_router(fleet, tmp_path
     assert "the router does not know this certificate" in " ".join(done.stdout.split())
 
 
-@pytest.mark.parametrize("command", [("arm", "pause"), ("arm", "clear", ARM), ("arm", "reset", ARM)], ids=" ".join)
+@pytest.mark.parametrize(
+    "command",
+    [
+        *(("arm", *words, "--by", "ann") for words in (("pause",), ("clear", ARM), ("reset", ARM))),
+        ("job", "list"),
+        *(("job", "submit", "--kind", "hold", "--place", "rack", *words) for words in ((), ("--quote",))),
+    ],
+    ids=" ".join,
+)
 def test_a_request_without_a_reply_mentions_the_roster(fleet, tmp_path, monkeypatch, command):
-    monkeypatch.setattr(requests, "REPLY_S", 0.5)
+    for module, seconds in ((requests, "REPLY_S"), (job_client, "REPLY_S"), (jobs, "LISTEN_S")):
+        monkeypatch.setattr(module, seconds, 0.5)
     endpoint = issue_later(fleet, tmp_path / "k", RosterEntry("ann", "operator"))
-    done = CliRunner().invoke(app, [*command, "--by", "ann", "--endpoint", endpoint, "--fleet", "f"])
-    assert isinstance(done.exception, BusError)
+    done = CliRunner().invoke(app, [*command, "--endpoint", endpoint, "--fleet", "f"])
+    assert isinstance(done.exception, FleetError)
     assert "it reads its roster when it starts" in str(done.exception)
 
 

@@ -28,7 +28,7 @@ from fleet.live.arm.awards import ArmRecord, Closed
 from fleet.live.journal import Journal
 from scenarios.cli.main import main
 from scenarios.live.fleet_processes import chosen_arms, free_port, parts_of
-from scenarios.live.gateway import check, check_token, read_tokens
+from scenarios.live.gateway import ROLES, check, check_token, permitted_role, read_tokens, run_gateway
 from scenarios.spec.options import LiveSpec
 from tests import commands
 from tests.waiting import PATIENCE_S, wait_until
@@ -106,13 +106,19 @@ def test_a_port_in_use_is_one_sentence(thermofleet):
 KEYS = {
     "{keys} quickstart": "holds the keys of a fleet",
     "{keys} --add gateway:submitter": "has a certificate",
+    "{keys} --add arm_0:operator": "'arm_0' has the role arm in",
+    "{keys} --add x:arm --add gateway:submitter": "has a certificate",
     "{keys} --add x:router --host 'a b'": "is not a host name or address",
     "{keys} --add x:submiter": "did you mean 'submitter'?",
     "{keys} --add x": "is not NAME:ROLE",
     "{keys} --add ca:monitor": "cannot be named 'ca'",
-    "{keys} --extra y:arm": "SCENARIO is needed",
-    "{keys} --no-auctioneer": "SCENARIO is needed",
-    "{keys} quickstart --add y:arm": "leave SCENARIO and --extra out",
+    **{
+        f"{{keys}} {option}": f"{option.split()[0]} is for new keys. Give SCENARIO to make all keys (with --overwrite, "
+        for option in ("--extra y:arm", "--no-auctioneer", "--overwrite", "--host cell-1", "--days 9 --json")
+    },
+    "{keys} --add y:arm --host cell-1": "--host is for the certificate of a router",
+    "{keys} --add y:arm --no-auctioneer": "leave SCENARIO, --extra and --no-auctioneer out",
+    "{keys} quickstart --add y:arm": "leave SCENARIO, --extra and --no-auctioneer out",
     "{keys} quickstart --extra arm_0:arm --overwrite": "'arm_0' is taken",
     "{keys} nowhere": "No scenario 'nowhere'",
 }
@@ -184,6 +190,16 @@ def test_keys_are_made_shown_and_extended(thermofleet, folder):
     assert "a:b" in out
     assert "expired" not in out
     assert "(authority)" in out
+
+
+def test_the_hosts_of_a_new_certificate_of_a_router_are_named(thermofleet, folder):
+    renew = ("bus", "keys", folder, "--add", "router:router", "--overwrite")
+    for hosts, named in ((["cell-1", "10.0.0.7"], ", cell-1, 10.0.0.7"), ([], "")):
+        code, _, err = thermofleet(*renew, *(word for host in hosts for word in ("--host", host)))
+        assert code == 0
+        valid = f"'router' is valid only for localhost, 127.0.0.1, ::1{named}; --host adds others."
+        assert valid in " ".join(err.split())
+    assert "valid only for" not in thermofleet("bus", "keys", folder, "--add", "x:arm")[2]
 
 
 def test_up_gives_every_process_its_own_certificate_and_the_router_here_or_elsewhere(folder):
@@ -301,6 +317,7 @@ def test_a_missing_extra_is_named(thermofleet, monkeypatch):
     assert thermofleet("bus", "ros2", "bridge", "--fleet", "f", "--domain", "0").refused("pip install -e '.[ros2]'")
 
 
+TOKEN = "sixteen-or-more-characters"
 PLAIN, SECURE = "tcp/127.0.0.1:7447", "tls/127.0.0.1:7447"
 
 
@@ -329,14 +346,52 @@ def test_with_a_token_any_address_is_allowed_with_a_warning(caplog):
         ("operator sixteen-or-more-characters", 0o644, "chmod 600"),
         ("operater sixteen-or-more-characters", 0o600, "line 1: no role 'operater'; did you mean 'operator'?"),
         ("# nothing", 0o600, "has no tokens"),
+        (f"monitor {TOKEN}\n\noperator  {TOKEN}", 0o600, "tokens, lines 1 and 3: the same token."),
     ],
 )
 def test_a_file_of_tokens_says_what_is_wrong_with_it(tmp_path, content, mode, says):
     path = tmp_path / "tokens"
     path.write_text(content)
     path.chmod(mode)
-    with pytest.raises(FleetError, match=re.escape(says)):
+    with pytest.raises(FleetError, match=re.escape(says)) as error:
         read_tokens(path)
+    assert TOKEN not in str(error.value)
+
+
+def test_a_token_of_a_file_is_not_an_operator_s_as_well(tmp_path):
+    path = tmp_path / "tokens"
+    path.touch(0o600)
+    path.write_text(f"monitor {TOKEN}")
+    with pytest.raises(FleetError, match="is also a token of") as error:
+        run_gateway(PLAIN, "f", 0, "localhost", TOKEN, path)
+    assert TOKEN not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("role", "permits"),
+    {
+        "operator": "operator",
+        "submitter": "submitter",
+        "monitor": "monitor",
+        "recorder": "monitor",
+        "arm": "",
+        "auctioneer": "",
+        "policy": "",
+    }.items(),
+)
+def test_tokens_give_no_more_than_the_certificate(role, permits):
+    entry = RosterEntry("a", role)
+    allowed = ROLES[: ROLES.index(permits) + 1] if permits else ()
+    for number, token in enumerate(ROLES):
+        if token in allowed:
+            assert permitted_role("f", entry, {"t" * 16: token}) == permits
+            continue
+        refusal = f"'{role}:a' does not permit the requests of a token of the role {token}. Use a certificate of the "
+        needed = re.escape(f"{refusal}role {' or '.join(ROLES[number:])}, ")
+        with pytest.raises(FleetError, match=needed):
+            permitted_role("f", entry, {"t" * 16: token, "m" * 16: "monitor"})
+    if permits:
+        assert permitted_role("f", entry, {}) == permits
 
 
 def test_a_token_is_long_and_ascii():

@@ -8,6 +8,7 @@ import tomllib
 from datetime import UTC, datetime, timedelta, timezone
 from datetime import time as clock
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 import pyarrow as pa
@@ -33,6 +34,9 @@ from tests.scenarios.conftest import SMALL
 SHORT = "name,kind,places,payload,repetitions,release,due,hard,value,after"
 HEAD = (*SHORT.split(","), "dwell", "force")
 ROWS = ["load 1,sort,shelf > bench,0.2,3,0,60,yes,2,", "hold 1,hold,bench | shelf,2,1,0:01,,,,load 1"]
+
+
+DOCS = Path(__file__).parents[2] / "docs"
 
 
 def cells_of(job: Job) -> tuple[str, ...]:
@@ -490,3 +494,9 @@ def test_the_name_of_a_table_and_blank_rows_change_no_hash(tmp_path):
     other = with_table(tmp_path / "cell.toml", SMALL, "other.csv")
     assert first.jobs[0].row != other.jobs[0].row
     assert scenario_hash(first) == scenario_hash(other)
+
+
+def test_command_and_http_of_the_documentation_read_times_of_day_in_one_zone():
+    text = "".join((DOCS / page).read_text(encoding="utf-8") for page in ("how_to/job_table.md", "bus/client.md"))
+    begins = re.findall(r"shift[-_]begin[ =](2026[^\s'`]*)", text)
+    assert [*map(unquote, begins)] == 3 * ["2026-11-23T06:00+01:00"]

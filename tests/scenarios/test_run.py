@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from msgspec import structs
 
 from agents.registry import RULES
 from fleet.bus.protocol.auction import ArmEvent, ArmOffer, JobStatus, PlanQuote, Result
 from fleet.bus.protocol.messages import State
+from fleet.bus.protocol.operator import ControlRequest, Operation, Pause
 from fleet.errors import FleetError
 from fleet.events import Event
 from fleet.robot import ThermalLimits
@@ -343,8 +345,19 @@ def test_a_recording_has_what_arms_published_and_says_what_is_missing(tmp_path: 
     for number, time_s in enumerate((1.0, 21.0)):
         quoted = PlanQuote(difficulty=time_s, p_saturation=0.1, duration_s=60.0)
         offers = (ArmOffer("a", "idle", True, quoted), ArmOffer("b", "working", False))
-        recorder.add("boss", Result(auctioneer="boss", number=number, time_s=time_s, status=status, offers=offers))
+        awarded = structs.replace(status, award=f"award {number}")
+        recorder.add(
+            "boss",
+            Result("boss", number=number, time_s=time_s, status=awarded, offers=offers, difficulty=time_s),
+        )
+    request = ControlRequest("r", Pause("*"), "ann")
+    recorder.add("boss", Operation("boss", 30.0, request, 1))
     recorder.write(status="finished")
+    first = thread_of(tmp_path, "j")
+    assert first.award is not None
+    assert (first.award.time_s, first.job["award"], first.job["difficulty"]) == (0.0, "award 0", 1.0)
+    with pytest.raises(FleetError, match=r"'pause' is a request or an alarm, which has no causes .* award, return, "):
+        thread_of(tmp_path, "pause")
     thread = thread_of(tmp_path, "warning")
     assert thread.award is not None
     assert (thread.award.time_s, thread.twin) == (20.0, {"arm": "a", "version": "d:0123"})
@@ -353,6 +366,7 @@ def test_a_recording_has_what_arms_published_and_says_what_is_missing(tmp_path: 
         ("a", True, True, 21.0),
         ("b", False, False, None),
     ]
+    assert (thread.job["award"], thread.job["difficulty"]) == ("award 1", 21.0)
     assert (thread.job["value"], thread.code["hash"]) == (2.0, NOT_RECORDED)
     assert "state awarded, release 0:00:05, due 1:02:05, value 2" in dict(thread_table(thread).rows)["job"]
     assert json.loads(json_text(thread.as_json()))["event"]["kind"] == thread.event.kind

@@ -69,6 +69,15 @@ def issue(
     Raises:
         BusError: the folder has no authority that can sign, or it has expired.
     """
+    certificate, key = _signed(folder, participant, days=days, hosts=hosts, now=now)
+    _write_pair(folder, participant.file, certificate, key)
+    return certificate.not_valid_after_utc
+
+
+def _signed(
+    folder: Path, participant: RosterEntry, *, days: int, hosts: Sequence[str], now: datetime | None = None
+) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    """Certificate and private key of a participant, not written yet; arguments and errors as of `issue`."""
     if not 1 <= days <= LONGEST_DAYS:
         raise BusError(f"A certificate lasts 1 to {LONGEST_DAYS} days (got {days}).")
     now = now or datetime.now(UTC)
@@ -93,8 +102,7 @@ def issue(
     if is_router:
         names = [_host_name(host) for host in dict.fromkeys([*HERE, *hosts])]
         certificate = certificate.add_extension(x509.SubjectAlternativeName(names), critical=False)
-    _write_pair(folder, participant.file, certificate.sign(signer, hashes.SHA256()), key)
-    return expires
+    return certificate.sign(signer, hashes.SHA256()), key
 
 
 def read(folder: Path, file: str) -> x509.Certificate:
@@ -153,6 +161,15 @@ def common_name(certificate: x509.Certificate) -> str:
     """Common name of a certificate, as `arm:arm_0`; "" for none."""
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if names else ""
+
+
+def hosts_of(certificate: x509.Certificate) -> list[str]:
+    """Names and addresses of the machine for which a router's certificate is valid; none of another certificate."""
+    try:
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return []
+    return [str(name.value) for name in names]
 
 
 def format_time(moment: datetime) -> str:
@@ -284,30 +301,38 @@ def make(
 
 
 def add(
-    folder: Path, participant: RosterEntry, *, days: int, hosts: Sequence[str] = HERE, overwrite: bool = False
-) -> datetime:
-    """Issue a certificate by the present authority, to a new participant or, with `overwrite`, to a present one.
-
-    Returns:
-        When it expires.
+    folder: Path,
+    participants: Sequence[RosterEntry],
+    *,
+    days: int,
+    hosts: Sequence[str] = HERE,
+    overwrite: bool = False,
+) -> None:
+    """Issue certificates by the present authority, to new participants and, with `overwrite`, to present ones.
 
     Raises:
-        BusError: the name is taken, or the folder cannot sign.
+        BusError: a name is taken, or the folder cannot sign; no certificate is written.
     """
-    roster = read_roster(folder)
-    present = [one for one in roster.participants if one.name == participant.name]
-    if present and not overwrite:
-        raise BusError(f"'{participant.name}' has a certificate in '{folder}'; --overwrite gives it a new one.")
-    if present and present != [participant]:
-        raise BusError(f"'{participant.name}' has the role {present[0].role} in '{folder}', not {participant.role}.")
-    if not present:
-        try:
-            roster = Roster(roster.fleet, (*roster.participants, participant))
-        except ValueError as error:
-            raise BusError(str(error)) from error
-    expires = issue(folder, participant, days=days, hosts=hosts)
+    roster, participants = read_roster(folder), list(dict.fromkeys(participants))
+    present = {one.name: one for one in roster.participants}
+    for one in participants:
+        held = present.get(one.name, one)
+        if held != one:
+            raise BusError(
+                f"'{one.name}' has the role {held.role} in '{folder}', not {one.role}. Choose another name for the "
+                f"{one.role}."
+            )
+        if one.name in present and not overwrite:
+            raise BusError(f"'{one.name}' has a certificate in '{folder}'; --overwrite gives it a new one.")
+    new = [one for one in participants if one.name not in present]
+    try:
+        roster = Roster(roster.fleet, (*roster.participants, *new))
+    except ValueError as error:
+        raise BusError(str(error)) from error
+    signed = [(one.file, *_signed(folder, one, days=days, hosts=hosts)) for one in participants]
+    for file, certificate, key in signed:
+        _write_pair(folder, file, certificate, key)
     _write_roster(folder, roster)
-    return expires
 
 
 def lifetimes(folder: Path, roster: Roster) -> dict[str, tuple[datetime, datetime]]:

@@ -15,7 +15,7 @@ import pytest
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import JobStatus
+from fleet.bus.protocol.auction import JobStatus, Result
 from fleet.bus.protocol.operator import Alarm
 from fleet.bus.router import Router
 from fleet.errors import FleetError
@@ -29,6 +29,7 @@ from tests.live.gateway.moving_fleet import MovingFleet
 from tests.live.gateway.served import Served
 from tests.waiting import PATIENCE_S, wait_until
 
+DOCS = Path(__file__).parents[3] / "docs"
 ODD = 'a"b\\c\nd'
 SECRET = "0123456789abcdef"
 ALARM = Alarm("gateway", 1, 2.0, "7d1f", "fault", "arm_0 is faulted.")
@@ -105,8 +106,27 @@ def test_what_is_counted_is_0_if_there_is_none():
     assert {key for key in full if key[0] in zero} == {key for key in values if key[0] in zero}
 
 
+def test_cached_messages_are_counted_as_the_documentation_says(router):
+    with BusClient(router, "g") as link, BusClient(router, "g") as late:
+        publish = link.publisher(keys.of_auction("g", "early", "result"), Result)
+        for number in range(3):
+            publish(Result("early", number, 1.0, JobStatus(f"early {number}", "cancelled")))
+        listener = FleetListener(late)
+
+        def counted():
+            listener.serve(0.0)
+            late.serve()
+            return listener.view.snapshot(0.0).changes.get("cancelled", 0) >= 3
+
+        wait_until(counted)
+    text = " ".join((DOCS / "how_to" / "operate.md").read_text(encoding="utf-8").split())
+    names = [f"thermofleet_{name}" for name, (_, what) in METRICS.items() if what.endswith("cached ones included.")]
+    assert f"`{'` and `'.join(names)}` also count earlier messages" in text
+    assert f"the last {keys.HISTORY} of each" in text
+
+
 def test_the_dashboard_uses_only_metrics_that_are_exported():
-    dashboard = Path(__file__).parents[3] / "docs" / "assets" / "grafana.json"
+    dashboard = DOCS / "assets" / "grafana.json"
     used = set(re.findall(r"thermofleet_(\w+)", dashboard.read_text(encoding="utf-8")))
     assert used
     assert used <= set(METRICS)
