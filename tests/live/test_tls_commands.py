@@ -183,7 +183,7 @@ def test_an_error_of_tls_is_one_sentence(fleet):
 
 def issue_later(fleet, place, entry):
     """Endpoint with a certificate that was issued after the router has read its roster."""
-    make(place, of_arms("f", [ARM]), days=30)
+    make(place, of_arms("f", [ARM], [entry]), days=30)
     for name in ("ca.pem", "ca.key"):
         (place / name).write_bytes((fleet.keys / name).read_bytes())
     issue(place, entry, days=20)
