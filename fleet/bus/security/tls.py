@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 from urllib.parse import unquote
 
 from fleet.bus.security.access_control import ROLES, ROSTER, Role, RosterEntry, file_of, read_roster
-from fleet.errors import BusError
+from fleet.errors import BusError, is_name
 
 if TYPE_CHECKING:  # plain TCP does not need the library
     from cryptography import x509
@@ -98,11 +98,17 @@ def identified(endpoint: str) -> tuple[str, Tls | None]:
     """Address and participant of an endpoint `tls/HOST:PORT#FOLDER/NAME`; None if it names no participant.
 
     NAME is the file name of the certificate without its ending, so every name can be written.
+
+    Raises:
+        BusError: NAME cannot be the name of a participant.
     """
     address, _, path = endpoint.partition("#")
     if not (path and address.startswith("tls/")):
         return endpoint, None
-    return address, Tls(Path(path).parent, unquote(Path(path).name))
+    name = unquote(Path(path).name)
+    if not is_name(name):
+        raise BusError(f"Endpoint '{endpoint}' names no participant. Expected {address}#FOLDER/NAME.")
+    return address, Tls(Path(path).parent, name)
 
 
 def participant_at(endpoint: str) -> RosterEntry | None:
