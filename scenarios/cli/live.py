@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from agents.registry import WRAPPERS_HELP, names_of
-from fleet.errors import FleetError
+from fleet.errors import BusError, FleetError
 from fleet.fields import MAX_SPEED, MIN_SPEED, argument, option
 from scenarios.cli import options
 from scenarios.cli.options import From, Given
@@ -223,6 +223,8 @@ def record_command(
     missed = sum(count.missed for count in recorder.counts.values())
     kept = sum(count.kept for count in recorder.counts.values())
     say(f"Recorded {kept} messages in {out}, {missed} missed.", out_console)
+    if expiry := link.expiry:
+        raise BusError(f"Nothing has been recorded since the certificate expired. {expiry}")
     stop.leave("The recording is complete up to now; the same command continues it.")
 
 
