@@ -19,6 +19,7 @@ from fleet.bus.protocol.auction import SETTLED, ArmEvent, JobState, Result
 from fleet.bus.protocol.operator import Alarm
 from fleet.bus.router import fleets_at
 from fleet.errors import NoRouter
+from fleet.live.monitor.health import check_pauses
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetListener, FleetSnapshot, JobScore, describe_status
 from fleet.live.space import ANYWHERE
 from scenarios.cli.options import the_fleet
@@ -200,7 +201,9 @@ def screen(
         joints: Show every motor in place of jobs.
         end_s: Fleet time at which the shift ends.
     """
-    notices = wrap(fleet.expiry, width) if fleet.lost_s is not None else []
+    texts = [(fleet.expiry, "red")] if fleet.lost_s is not None else []
+    texts += [(finding.what, "yellow") for finding in check_pauses(fleet)]
+    notices = [(line, style) for text, style in texts for line in wrap(text, width)]
     height -= FRAME
     notices = notices[: int(max(0, min(NOTICES, height - 1)))]
     height -= len(notices)
@@ -211,7 +214,7 @@ def screen(
         urgent = sorted(arms, key=lambda arm: (not arm.token, 1e9 if arm.headroom_k is None else arm.headroom_k))
         shown = {arm.arm for arm in urgent[: int(room) - 1]}
         arms = tuple(arm for arm in arms if arm.arm in shown)
-    parts: list[Table | Text] = [heading(fleet), *(_line((text, "red")) for text in notices), time_line(fleet, end_s)]
+    parts: list[Table | Text] = [heading(fleet), *map(_line, notices), time_line(fleet, end_s)]
     parts.append(joint_table(arms) if joints else arm_table(arms, wide=width >= WIDE))
     if len(arms) < len(fleet.arms):
         parts.append(Text(f"… and {len(fleet.arms) - len(arms)} more with more headroom", style="dim"))

@@ -63,6 +63,10 @@ def test_the_screen_tells_why_there_is_no_connection():
     assert EXPIRY in " ".join(told.split())
 
 
+def test_the_screen_tells_who_has_paused_arms():
+    assert "All arms are paused by 'root'." in shown(replace(fleet_of([arm_now()]), paused={"*": "root"}))
+
+
 @given(
     arms=st.integers(0, 40),
     width=st.integers(60, 200),
