@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from functools import lru_cache, partial
-from typing import Any, Generic, Self, TypeVar, TypeVarTuple
+from typing import Any, Generic, Literal, Self, TypeVar, TypeVarTuple
 
 import msgspec
 import zenoh
@@ -28,7 +28,7 @@ from fleet.bus.protocol.keys import BusChannel, Pattern, channel_for, channel_of
 from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, check_name, decode, encode, encoding
 from fleet.bus.router import Connection
 from fleet.bus.security.access_control import RosterEntry, rights_by_role
-from fleet.bus.security.tls import expires_at, is_past, participant_at
+from fleet.bus.security.tls import check_listed, expires_at, is_past, participant_at
 from fleet.errors import BusError, Refused, RefusedForNow
 
 _LOG = logging.getLogger(__name__)
@@ -42,6 +42,9 @@ Arguments = TypeVarTuple("Arguments")
 BACKLOG = 4096
 MOST_REPLIES = 1024
 """Replies to one query that are read: one of each arm of the largest fleet."""
+
+Action = Literal["publish", "show the token", "reply to", "query"]
+"""What a certificate may or may not allow under a key."""
 
 _SENDER: Mapping[str, str] = {"arm": "arm", "auction": "auctioneer", "monitor": "monitor"}
 """The field of a message that names the sender, by the role in its key."""
@@ -158,12 +161,15 @@ class BusClient(Connection):
         """Connect.
 
         Raises:
-            BusError: no router accepts the connection, or `stopped` meanwhile.
+            BusError: no router accepts the connection, or `stopped` meanwhile; or by the roster in the folder of its
+                certificate the router would drop everything.
         """
         if self._session is None:
-            super().open()
             self._participant = participant_at(self._endpoint)
+            if self._participant is not None:
+                check_listed(self._endpoint, self._participant, self.fleet)
             self._expires = expires_at(self._endpoint)
+            super().open()
         return self
 
     @property
@@ -214,9 +220,22 @@ class BusClient(Connection):
 
     # Publishing
 
-    def publisher(self, key: str, kind: type[Message]) -> Callable[[Message], None]:
-        """A function that publishes messages under one key; late subscribers get the history that the registry sets."""
+    def objection(self, action: Action, key: str) -> str:
+        """Why the router would drop this, by the role of the certificate; "" if it would not, and without TLS."""
+        return "" if self._participant is None else _objection(self.fleet, self._participant, action, key)
+
+    def publisher(self, key: str, kind: type[Message], *, check: bool = True) -> Callable[[Message], None]:
+        """A function that publishes messages under one key; late subscribers get the history that the registry sets.
+
+        Args:
+            check: Whether the certificate must allow it; otherwise perhaps only this client receives the messages.
+
+        Raises:
+            BusError: the client is not open, or its certificate does not allow it.
+        """
         channel, settings = _transport(key, "publish", kind)
+        if check:
+            self._check("publish", key)
         publisher = advanced.declare_advanced_publisher(
             self._open(),
             key,
@@ -229,13 +248,15 @@ class BusClient(Connection):
         return lambda message: publisher.put(encode(message))
 
     def publish(self, key: str, message: msgspec.Struct) -> None:
-        """Publish one message to the present subscribers, without history."""
+        """Publish one message to the present subscribers, without history; raises as `publisher`."""
         _, settings = _transport(key, "publish", type(message))
+        self._check("publish", key)
         self._open().put(key, encode(message), **settings)
 
     def declare_token(self, key: str) -> None:
-        """Show a liveliness token until this client is closed or loses its connection."""
+        """Show a liveliness token until this client is closed or loses its connection; raises as `publisher`."""
         channel_for(key, "token")
+        self._check("show the token", key)
         self._keep(self._open().liveliness().declare_token(key))
 
     # Querying
@@ -265,8 +286,7 @@ class BusClient(Connection):
         channel, settings = _transport(key, "query", type(request))
         if channel.reply is not kind:
             raise ValueError(f"'{key}' is answered with {channel.reply}, not with {kind}.")
-        if self._participant is not None:
-            self._check_may_query(self._participant, key)
+        self._check("query", key)
         pending = _PendingQuery(self, kind, most, timeout_s, each, done)
         try:
             self._open().get(
@@ -337,8 +357,12 @@ class BusClient(Connection):
 
         A key may end in `*` for the querier (`keys.asked_by_every_arm`); replies then go under the key of the query. A
         request that names another arm than that key is malformed.
+
+        Raises:
+            BusError: the client is not open, or its certificate does not allow it.
         """
         channel_for(key, "query", kind)
+        self._check("reply to", key)
         receive = _direct(partial(self._receive, key, kind, handle))
         self._keep(self._open().declare_queryable(key, receive, complete=True))
 
@@ -420,16 +444,9 @@ class BusClient(Connection):
 
     # Inside
 
-    def _check_may_query(self, participant: RosterEntry, key: str) -> None:
-        queried = zenoh.KeyExpr(key)
-        allowed = [
-            role
-            for role, rights in rights_by_role(self.fleet, participant.name).items()
-            if any(zenoh.KeyExpr(expression).includes(queried) for expression in rights.queries)
-        ]
-        if participant.role not in allowed:
-            needed = f"; that takes a certificate of the role {' or '.join(allowed)}" if allowed else ""
-            raise BusError(f"'{participant.common_name}' may not query '{key}'{needed}.")
+    def _check(self, action: Action, key: str) -> None:
+        if objection := self.objection(action, key):
+            raise BusError(objection)
 
     def _token(self, key: str, present: bool, handle: Callable[[str, bool], None]) -> None:
         try:
@@ -552,6 +569,24 @@ def _add(table: dict[str, Entry], key: str, entry: Entry) -> None:
         number += 1
         name = f"{key} ({number})"
     table[name] = entry
+
+
+@lru_cache(4096)
+def _objection(fleet: str, participant: RosterEntry, action: Action, key: str) -> str:
+    """As `BusClient.objection`, of a participant of a fleet."""
+    expression, name = zenoh.KeyExpr(key), participant.name
+    if action != "query":
+        name = keys.owner_of(key) or name
+    allowed: list[str] = []
+    for role, rights in rights_by_role(fleet, name).items():
+        granted = rights.queries if action == "query" else rights.publishes
+        if any(zenoh.KeyExpr(each).includes(expression) for each in granted):
+            allowed.append(role)
+    if participant.name == name and participant.role in allowed:
+        return ""
+    named = "" if participant.name == name else f" and the name '{name}'"
+    needed = f"; that takes a certificate of the role {' or '.join(allowed)}{named}" if allowed else ""
+    return f"'{participant.common_name}' may not {action} '{key}'{needed}."
 
 
 @lru_cache(4096)

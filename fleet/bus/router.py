@@ -20,7 +20,7 @@ from fleet.bus.protocol.keys import SESSION_LEASE_S
 from fleet.bus.protocol.messages import MOST_BYTES
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES
 from fleet.bus.security.access_control import ROSTER, Roster, access_control, read_roster
-from fleet.bus.security.tls import Tls, identified, why_not
+from fleet.bus.security.tls import Tls, identified, participant_at, why_not
 from fleet.errors import BusError, NoRouter
 
 _LOG = logging.getLogger(__name__)
@@ -415,10 +415,11 @@ def fleets_at(endpoint: str, *, timeout_s: float = 5.0) -> tuple[str, ...]:
     With TLS no participant may look beyond its own fleet, which the roster in its folder names, if there is one.
 
     Raises:
-        BusError: no router accepted the connection.
+        BusError: no router accepted the connection, or the certificate is missing or damaged.
     """
     _, tls = identified(endpoint)
     if tls is not None:
+        participant_at(endpoint)
         return (read_roster(tls.folder).fleet,) if (tls.folder / ROSTER).exists() else ()
     fleets: set[str] = set()
     for key in _tokens(endpoint, ALL_TOKENS, timeout_s):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from agents.registry import WRAPPERS_HELP, names_of
-from fleet.errors import FleetError
+from fleet.errors import BusError, FleetError
 from fleet.fields import MAX_SPEED, MIN_SPEED, argument, option
 from scenarios.cli import options
 from scenarios.cli.options import From, Given
@@ -223,6 +223,8 @@ def record_command(
     missed = sum(count.missed for count in recorder.counts.values())
     kept = sum(count.kept for count in recorder.counts.values())
     say(f"Recorded {kept} messages in {out}, {missed} missed.", out_console)
+    if expiry := link.expiry:
+        raise BusError(f"Nothing has been recorded since the certificate expired. {expiry}")
     stop.leave("The recording is complete up to now; the same command continues it.")
 
 
@@ -232,18 +234,27 @@ def replay_command(
     fleet: str | None = option("Name of the fleet. Default: that of the recording.", None),
     speed: float = option("Recorded seconds per real second.", 1.0, low=0, high=MAX_SPEED, above=True),
 ) -> None:
-    """Publish a run or a recording on the bus, in real time or at --speed."""
+    """Publish a run or a recording on the bus, in real time or at --speed; needs a router without TLS."""
     from fleet.bus.client import BusClient
-    from scenarios.live.recording import open_messages, replay
+    from scenarios.live.recording import STATE_GAP_S, open_messages, replay
     from scenarios.signals import until_stopped
 
+    if endpoint.startswith("tls/"):
+        raise FleetError("A replay publishes as every arm, which no certificate allows: give a router without TLS.")
     messages = open_messages(path)
     if not len(messages):
         raise FleetError(f"'{path}' holds no messages. Record longer.")
-    with until_stopped() as stop, BusClient(endpoint, fleet or messages.fleet) as link:
+    connect = partial(BusClient, endpoint, fleet or messages.fleet)
+    with until_stopped() as stop, connect() as link:
         echo(f"ready replay {endpoint}")
-        count = replay(messages, link, speed=speed, stopped=stop.is_set)
-    say(f"Published {count} of {len(messages)} messages.", out_console)
+        count = replay(messages, link, connect=connect, speed=speed, stopped=stop.is_set)
+    say(f"Published {count.published} of {len(messages)} messages.", out_console)
+    if count.left_out:
+        say(
+            f"Left out {count.left_out} states that were due less than {1000 * STATE_GAP_S:.0f} ms after the one "
+            "before of their arm: a router limits their rate. A lower --speed publishes them.",
+            out_console,
+        )
     stop.leave("The replay was interrupted.")
 
 

@@ -434,7 +434,7 @@ class RecorderNode:
 def record(
     link: BusClient, folder: Path, *, rotate_s: float, stopped: Callable[[], bool], connect: Callable[[], BusClient]
 ) -> Recorder:
-    """Record until stopped; return the recorder, everything written.
+    """Record until stopped, or until the certificate expires; return the recorder, everything written.
 
     Args:
         rotate_s: Real seconds between two Parquet parts.
@@ -449,7 +449,7 @@ def record(
         lock_folder(folder),
         closing(RecorderNode(link, Recorder.open(folder, link.fleet), connect, rotate_s=rotate_s)) as node,
     ):
-        while not stopped():
+        while not (stopped() or link.expiry):
             node.serve()
         node.end()
     return node.recorder

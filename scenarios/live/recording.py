@@ -10,6 +10,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from heapq import merge
 from pathlib import Path
@@ -69,6 +70,8 @@ _SORTED_BY: dict[Kind, str] = {"telemetry": "tick", "gaps": "first"}
 """Besides the time; `number` for the other kinds."""
 TURN_S = 0.2
 """Real seconds between two checks for a stop request."""
+STATE_GAP_S = 2.0 / (keys.CHANNEL["arm", "state"].limit_hz or math.inf)
+"""Least real seconds between two replayed states of an arm: a router drops those that come within half of it."""
 
 
 class Gap(msgspec.Struct, frozen=True):
@@ -347,8 +350,28 @@ def _operation(row: dict[str, object]) -> Operation:
     return msgspec.convert({**row, "request": request}, Operation)
 
 
-def replay(messages: RecordedMessages, link: BusClient, *, speed: float, stopped: Callable[[], bool]) -> int:
-    """Publish messages at their own pace times `speed`, with the tokens of their arms; return how many were published.
+class ReplayCount(NamedTuple):
+    """Number of messages of a replay."""
+
+    published: int
+    left_out: int
+    """States that came less than `STATE_GAP_S` after the one before."""
+
+
+def replay(
+    messages: RecordedMessages,
+    link: BusClient,
+    *,
+    connect: Callable[[], BusClient],
+    speed: float,
+    stopped: Callable[[], bool],
+) -> ReplayCount:
+    """Publish messages at their own pace times `speed`, with the tokens of their arms.
+
+    A router limits the states of each session, so every arm has its own, as a running arm.
+
+    Args:
+        connect: Makes another client of the fleet, not open yet.
 
     Raises:
         FleetError: an arm of the recording is present on the bus.
@@ -357,27 +380,35 @@ def replay(messages: RecordedMessages, link: BusClient, *, speed: float, stopped
     present = link.tokens(keys.of_every_arm(link.fleet, "alive"))
     if taken := sorted(present & set(arms)):
         raise FleetError(f"Arm '{taken[0]}' of fleet '{link.fleet}' is on the bus already. Give another --fleet.")
-    for arm in arms:
-        link.declare_token(keys.of_arm(link.fleet, arm, "alive"))
-    publishers: dict[str, Callable[[Message], None]] = {}
-    start_s, first_s, count = time.monotonic(), None, 0
-    for message in messages:
-        first_s = message.time_s if first_s is None else first_s
-        due_s = start_s + (message.time_s - first_s) / speed
-        while time.monotonic() < due_s and not stopped():
-            link.serve(min(due_s, time.monotonic() + TURN_S))
-        if stopped():
-            break
-        match message:
-            case Result(auctioneer=sender) | Operation(auctioneer=sender) | Alarm(monitor=sender):
-                pass
-            case State(arm=sender) | ArmEvent(arm=sender):
-                pass
-        sources = [source for source in SOURCES if isinstance(message, source.message)]
-        source = next((each for each in sources if (each.role == "arm") == (sender in arms)), sources[0])
-        key = str(keys.ParsedKey(link.fleet, source.role, sender, source.topic))
-        if key not in publishers:
-            publishers[key] = link.publisher(key, source.message)
-        publishers[key](message)
-        count += 1
-    return count
+    with ExitStack() as resources:
+        links = {arm: resources.enter_context(connect()) for arm in arms}
+        for arm in arms:
+            links[arm].declare_token(keys.of_arm(link.fleet, arm, "alive"))
+        publishers: dict[str, Callable[[Message], None]] = {}
+        last_due_s: dict[str, float] = {}  # of the states, by arm
+        start_s, first_s, published, left_out = time.monotonic(), None, 0, 0
+        for message in messages:
+            first_s = message.time_s if first_s is None else first_s
+            due_s = start_s + (message.time_s - first_s) / speed
+            while time.monotonic() < due_s and not stopped():
+                link.serve(min(due_s, time.monotonic() + TURN_S))
+            if stopped():
+                break
+            match message:
+                case Result(auctioneer=sender) | Operation(auctioneer=sender) | Alarm(monitor=sender):
+                    pass
+                case ArmEvent(arm=sender):
+                    pass
+                case State(arm=sender):
+                    if due_s - last_due_s.get(sender, -math.inf) < STATE_GAP_S:
+                        left_out += 1
+                        continue
+                    last_due_s[sender] = due_s
+            sources = [source for source in SOURCES if isinstance(message, source.message)]
+            source = next((each for each in sources if (each.role == "arm") == (sender in arms)), sources[0])
+            key = str(keys.ParsedKey(link.fleet, source.role, sender, source.topic))
+            if key not in publishers:
+                publishers[key] = links.get(sender, link).publisher(key, source.message)
+            publishers[key](message)
+            published += 1
+    return ReplayCount(published, left_out)

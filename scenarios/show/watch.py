@@ -5,6 +5,7 @@ import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
+from textwrap import wrap
 from typing import get_args
 
 import msgspec
@@ -18,6 +19,7 @@ from fleet.bus.protocol.auction import SETTLED, ArmEvent, JobState, Result
 from fleet.bus.protocol.operator import Alarm
 from fleet.bus.router import fleets_at
 from fleet.errors import NoRouter
+from fleet.live.monitor.health import check_pauses
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetListener, FleetSnapshot, JobScore, describe_status
 from fleet.live.space import ANYWHERE
 from scenarios.cli.options import the_fleet
@@ -40,8 +42,8 @@ COOL_C = 20.0
 """A bar begins at this temperature and is full at the warning limit."""
 HEAT_CELLS = 10
 """Characters of a bar."""
-FRAME, EVENTS = 7, 6
-"""Lines of the screen that are neither arms nor events; events shown."""
+FRAME, NOTICES, EVENTS = 7, 6, 6
+"""Lines of the screen that are neither arms nor notices nor events; lines of notices, and events, shown at most."""
 WIDE = 120
 """Columns from which the scores of open jobs and the ages of messages are shown."""
 _MODE_STYLES = {"faulted": "bold red", "working": "green"}
@@ -199,14 +201,20 @@ def screen(
         joints: Show every motor in place of jobs.
         end_s: Fleet time at which the shift ends.
     """
-    events = events[max(0, len(events) - int(min(EVENTS, height - FRAME - 1))) :]
-    room = max(1, height - FRAME - len(events))
+    texts = [(fleet.expiry, "red")] if fleet.lost_s is not None else []
+    texts += [(finding.what, "yellow") for finding in check_pauses(fleet)]
+    notices = [(line, style) for text, style in texts for line in wrap(text, width)]
+    height -= FRAME
+    notices = notices[: int(max(0, min(NOTICES, height - 1)))]
+    height -= len(notices)
+    events = events[max(0, len(events) - int(min(EVENTS, height - 1))) :]
+    room = max(1, height - len(events))
     arms = fleet.arms
     if len(arms) > room:
         urgent = sorted(arms, key=lambda arm: (not arm.token, 1e9 if arm.headroom_k is None else arm.headroom_k))
         shown = {arm.arm for arm in urgent[: int(room) - 1]}
         arms = tuple(arm for arm in arms if arm.arm in shown)
-    parts: list[Table | Text] = [heading(fleet), time_line(fleet, end_s)]
+    parts: list[Table | Text] = [heading(fleet), *map(_line, notices), time_line(fleet, end_s)]
     parts.append(joint_table(arms) if joints else arm_table(arms, wide=width >= WIDE))
     if len(arms) < len(fleet.arms):
         parts.append(Text(f"… and {len(fleet.arms) - len(arms)} more with more headroom", style="dim"))

@@ -2,24 +2,40 @@
 
 import itertools
 import queue
+import re
+import shutil
 import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
+import msgspec
 import pytest
 import zenoh
 
 from fleet.bus.client import BusClient, Refused, Replies
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import Ack, Award, JobSpec, Lease, LeaseEntry, LeaseRequest, Receipt, Report
+from fleet.bus.protocol.auction import (
+    Ack,
+    Award,
+    Clock,
+    ClockRequest,
+    JobSpec,
+    Lease,
+    LeaseEntry,
+    LeaseRequest,
+    Receipt,
+    Report,
+)
 from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, GrantedEntry
-from fleet.bus.protocol.messages import Info, encode, encoding
+from fleet.bus.protocol.messages import Info, State, encode, encoding
+from fleet.bus.protocol.operator import Cleared, ClearRequest
 from fleet.bus.router import Router, open_client
-from fleet.bus.security.access_control import RosterEntry
+from fleet.bus.security.access_control import ROSTER, RosterEntry, of_arms
 from fleet.bus.security.certificates import issue
 from fleet.bus.security.tls import Tls
+from fleet.errors import BusError
 from tests.waiting import PATIENCE_S, serve_until
 
 ARMS = ("arm_0", "arm_1", "arm 2+*@")
@@ -232,6 +248,61 @@ def test_an_arm_neither_renews_nor_reports_nor_claims_for_another(side, connect,
         for nobody in (keys.asked_by_every_arm("f", owner, topic), keys.all_of("f", role, owner)):
             assert ask_under(nobody, "arm_0") == []
         assert len(taken) == (2 if side == "guarded" else 4)
+
+
+DENIED = {
+    "recorder": (
+        lambda link: link.publisher(keys.of_arm("f", "arm_0", "state"), State),
+        "'recorder:recorder' may not publish 'thermofleet/v4/f/arm/arm_0/state'; that takes a certificate of the role "
+        "arm and the name 'arm_0'.",
+    ),
+    "arm_1": (
+        lambda link: link.declare_token(keys.of_arm("f", "arm_0", "alive")),
+        "'arm:arm_1' may not show the token 'thermofleet/v4/f/arm/arm_0/alive'; that takes a certificate of the role "
+        "arm and the name 'arm_0'.",
+    ),
+    "monitor": (
+        lambda link: link.publish(keys.of_arm("f", "arm_0", "info"), Info("arm_0", 7, "t")),
+        "'monitor:monitor' may not publish 'thermofleet/v4/f/arm/arm_0/info'; that takes a certificate of the role arm "
+        "and the name 'arm_0'.",
+    ),
+    "submitter": (
+        lambda link: link.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(1.0, 1.0)),
+        "'submitter:submitter' may not reply to 'thermofleet/v4/f/clock/now'; that takes a certificate of the role arm "
+        "or auctioneer.",
+    ),
+    "auctioneer": (
+        lambda link: link.query(keys.of_jobs("f", "clear"), ClearRequest("a", "b"), Cleared, print, timeout_s=1.0),
+        "'auctioneer:auctioneer' may not query 'thermofleet/v4/f/jobs/clear'; that takes a certificate of the role "
+        "operator.",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DENIED)
+def test_a_client_states_what_its_certificate_does_not_allow(guarded, open_router, folder, name):
+    act, sentence = DENIED[name]
+    with (
+        BusClient(Tls(folder, name).endpoint(guarded.endpoint), "f") as link,
+        pytest.raises(BusError, match=f"^{re.escape(sentence)}$"),
+    ):
+        act(link)
+    with BusClient(open_router.endpoint, "f") as link:
+        act(link)
+
+
+def test_a_client_that_the_roster_of_its_folder_does_not_allow_is_not_opened(guarded, folder, tmp_path):
+    for name in ("ca.pem", "arm_0.pem", "arm_0.key"):
+        shutil.copy(folder / name, tmp_path / name)
+    endpoint = Tls(tmp_path, "arm_0").endpoint(guarded.endpoint)
+    BusClient(endpoint, "f").open().close()  # without a roster nothing is known
+    (tmp_path / ROSTER).write_bytes(msgspec.json.encode(of_arms("f", ["arm_1"])))
+    with pytest.raises(BusError, match=r"'arm:arm_0' is not in '.*roster\.json'.* bus keys --add"):
+        BusClient(endpoint, "f").open()
+    (tmp_path / ROSTER).write_bytes(msgspec.json.encode(of_arms("f", ["arm_0"])))
+    with pytest.raises(BusError, match="are for the fleet 'f', so a router forwards nothing of the fleet 'g'"):
+        BusClient(endpoint, "g").open()
+    BusClient(endpoint, "f").open().close()
 
 
 def test_a_late_joiner_gets_the_last_words_also_of_a_later_publisher(endpoint_of):

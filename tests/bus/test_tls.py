@@ -13,7 +13,7 @@ import zenoh
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.router import Router, open_client
+from fleet.bus.router import Router, fleets_at, open_client
 from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import issue, make
 from fleet.bus.security.tls import Tls
@@ -67,6 +67,23 @@ def test_nobody_gets_in_without_a_certificate(open_stranger, guarded, folder):
         open_client(guarded.endpoint, timeout_s=PATIENCE_S)
     with pytest.raises(BusError, match=r"There is no '.*nobody\.pem'"):
         open_client(guarded.endpoint, timeout_s=PATIENCE_S, tls=Tls(folder, "nobody"))
+
+
+@pytest.mark.parametrize(
+    ("participant", "reason"),
+    [
+        ("nodir/monitor", r"There is no '.*nodir/monitor\.pem'; thermofleet bus keys makes it\."),
+        ("f/nobody", r"There is no '.*f/nobody\.pem'; thermofleet bus keys makes it\."),
+        ("f", r"There is no '.*/f\.pem'; name a participant of the folder, as '.*/f/monitor'\."),
+        ("f/", r"There is no '.*/f\.pem'; name a participant of the folder, as '.*/f/monitor'\."),
+        ("f/..", r"names no participant\. Expected tls/127\.0\.0\.1:\d+#FOLDER/NAME\."),
+    ],
+)
+def test_a_wrong_path_of_a_certificate_is_named_by_whoever_uses_the_endpoint(guarded, folder, participant, reason):
+    endpoint = f"{guarded.endpoint}#{folder.parent}/{participant}"
+    for use in (fleets_at, lambda endpoint: BusClient(endpoint, "f").open()):
+        with pytest.raises(BusError, match=reason):
+            use(endpoint)
 
 
 def test_plain_tcp_and_tls_do_not_meet(guarded, open_router, folder):

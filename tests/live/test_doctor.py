@@ -106,6 +106,20 @@ def test_space_of_an_arm_that_has_gone_is_a_fault_if_jobs_wait_for_it():
     assert sum(WAY in each for each in output) == 1
 
 
+@pytest.mark.parametrize(
+    ("paused", "says"),
+    [
+        ({"*": "root"}, ["All arms are paused by 'root'."]),
+        ({"*": "root", "a": "root"}, ["All arms are paused by 'root'."]),
+        ({"a": "ann", "b": "ann", "c": ""}, ["a, b are paused by 'ann'.", "c is paused."]),
+    ],
+)
+def test_a_pause_is_a_note(paused, says):
+    found = check_health(msgspec.structs.replace(fleet(arm()), paused=paused), 101.505, [ASKED])
+    assert [(finding.level, finding.what) for finding in found.findings] == [("note", each) for each in says]
+    assert found.healthy
+
+
 def test_a_healthy_fleet_has_no_findings():
     output, found = faults(fleet(arm()))
     assert output == []

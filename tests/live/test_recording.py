@@ -312,10 +312,12 @@ def test_a_replay_publishes_the_same_messages_and_refuses_names_of_present_arms(
         # The subscription may follow the card by some time.
         begin = partial(link.publish, keys.of_auction("f", "boss", "operation"), operation(0))
         wait_until(lambda: rows(tmp_path / "second", "operations"), begin)
-        assert replay(messages, link, speed=100.0, stopped=lambda: False) == 60
+        connect = partial(BusClient, router.endpoint, "f")
+        assert replay(messages, link, connect=connect, speed=40.0, stopped=lambda: False) == (60, 0)
         serve_until(lambda: rows(tmp_path / "second", "results") == 20, link)
-        with BusClient(router.endpoint, "f") as other, pytest.raises(FleetError, match="on the bus already"):
-            replay(messages, other, speed=100.0, stopped=lambda: False)
+        link.declare_token(keys.of_arm("f", "a", "alive"))
+        with connect() as other, pytest.raises(FleetError, match="on the bus already"):
+            replay(messages, other, connect=connect, speed=40.0, stopped=lambda: False)
     for kind in ("telemetry", "events", "results"):
         assert read_parts(tmp_path / "second", kind).equals(read_parts(tmp_path / "first", kind)), kind
 
@@ -326,13 +328,32 @@ def test_a_replay_publishes_a_request_under_the_key_of_its_arm_or_auctioneer(tmp
     recorder.add("boss", operation(1))
     recorder.add_unnumbered("a", Operation("a", 2.0, ControlRequest("pause", Pause(), "ann")))
     recorder.write()
-    link = MagicMock(fleet="f")
+    link, arm = MagicMock(fleet="f"), MagicMock(fleet="f")
     link.tokens.return_value = set()
-    assert replay(open_messages(tmp_path), link, speed=100.0, stopped=lambda: False) == 3
-    of_requests = {
-        call.args[0] for call in link.publisher.mock_calls if len(call.args) == 2 and call.args[1] is Operation
-    }
-    assert of_requests == {keys.of_auction("f", "boss", "operation"), keys.of_arm("f", "a", "operation")}
+    arm.__enter__.return_value = arm
+    messages = open_messages(tmp_path)
+    assert replay(messages, link, connect=lambda: arm, speed=100.0, stopped=lambda: False) == (3, 0)
+    link.publisher.assert_called_once_with(keys.of_auction("f", "boss", "operation"), Operation)
+    arm.publisher.assert_any_call(keys.of_arm("f", "a", "operation"), Operation)
+
+
+def test_a_replay_shows_every_arm_to_a_subscriber_without_history_and_counts_states_that_come_too_soon(tmp_path):
+    recorder = Recorder.open(tmp_path, "f")
+    arms = {"a", "b", "c", "d"}
+    for tick in range(20):
+        for arm in sorted(arms):
+            recorder.add(arm, state(arm, tick))
+    recorder.write()
+    messages, seen = open_messages(tmp_path), []
+    with Router(state_hz=keys.CHANNEL["arm", "state"].limit_hz) as router:
+        connect = partial(BusClient, router.endpoint, "f")
+        with connect() as link, connect() as other:
+            other.subscribe(keys.of_every_arm("f", "state"), State, lambda name, _: seen.append(name))
+            assert replay(messages, link, connect=connect, speed=40.0, stopped=lambda: False) == (80, 0)
+            serve_until(lambda: all(seen.count(arm) >= 10 for arm in arms), other)
+    stub = MagicMock(fleet="f")
+    stub.tokens.return_value = set()
+    assert replay(messages, stub, connect=lambda: stub, speed=80.0, stopped=lambda: False) == (40, 40)
 
 
 def test_two_recorders_cannot_share_a_folder(tmp_path):

@@ -193,9 +193,19 @@ def test_an_error_of_tls_is_one_sentence(fleet):
         raise done.exception
 
 
+def test_a_recorder_whose_certificate_expires_ends_with_an_error(fleet, tmp_path, monkeypatch):
+    record = ["bus", "record", "f", "--out", str(tmp_path / "r"), "--endpoint", fleet.endpoint("recorder")]
+    monkeypatch.setattr("fleet.bus.client.is_past", lambda _: True)
+    done = CliRunner().invoke(app, record)
+    assert isinstance(done.exception, BusError)
+    assert "messages in" in done.stdout
+    with pytest.raises(BusError, match=r"^Nothing has been recorded since .*'recorder' expired on 20\d\d-.* UTC"):
+        raise done.exception
+
+
 def issue_later(fleet, place, entry):
     """Endpoint with a certificate that was issued after the router has read its roster."""
-    make(place, of_arms("f", [ARM]), days=30)
+    make(place, of_arms("f", [ARM], [entry]), days=30)
     for name in ("ca.pem", "ca.key"):
         (place / name).write_bytes((fleet.keys / name).read_bytes())
     issue(place, entry, days=20)

@@ -344,6 +344,12 @@ def chunk(name: str) -> str:
     return quote(name, safe="")
 
 
+def owner_of(expression: str) -> str:
+    """Name of the participant in a key, or a key expression for any querier; "" for jobs and clock."""
+    _, _, _, role, name, *_ = expression.split("/")
+    return "" if role in NAMELESS else unquote(name)
+
+
 def channel_of(expression: str) -> BusChannel:
     """The channel that a key, or a key expression with wildcards for names, belongs to.
 

@@ -213,7 +213,9 @@ def _bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except FileNotFoundError as error:
-        raise BusError(f"There is no '{path}'; thermofleet bus keys makes it.") from error
+        folder = path.with_suffix("")
+        hint = f"name a participant of the folder, as '{folder / 'monitor'}'" if folder.is_dir() else ""
+        raise BusError(f"There is no '{path}'; {hint or 'thermofleet bus keys makes it'}.") from error
     except OSError as error:
         raise BusError(f"Cannot read '{path}': {error.strerror}.") from error
 

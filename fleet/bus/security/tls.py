@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 from urllib.parse import unquote
 
-from fleet.bus.security.access_control import ROLES, Role, RosterEntry, file_of
-from fleet.errors import BusError
+from fleet.bus.security.access_control import ROLES, ROSTER, Role, RosterEntry, file_of, read_roster
+from fleet.errors import BusError, is_name
 
 if TYPE_CHECKING:  # plain TCP does not need the library
     from cryptography import x509
@@ -98,11 +98,17 @@ def identified(endpoint: str) -> tuple[str, Tls | None]:
     """Address and participant of an endpoint `tls/HOST:PORT#FOLDER/NAME`; None if it names no participant.
 
     NAME is the file name of the certificate without its ending, so every name can be written.
+
+    Raises:
+        BusError: NAME cannot be the name of a participant.
     """
     address, _, path = endpoint.partition("#")
     if not (path and address.startswith("tls/")):
         return endpoint, None
-    return address, Tls(Path(path).parent, unquote(Path(path).name))
+    name = unquote(Path(path).name)
+    if not is_name(name):
+        raise BusError(f"Endpoint '{endpoint}' names no participant. Expected {address}#FOLDER/NAME.")
+    return address, Tls(Path(path).parent, name)
 
 
 def participant_at(endpoint: str) -> RosterEntry | None:
@@ -118,6 +124,28 @@ def participant_at(endpoint: str) -> RosterEntry | None:
 
     role, _, name = common_name(certificate).partition(":")
     return RosterEntry(unquote(name), cast(Role, role)) if role in ROLES else None
+
+
+def check_listed(endpoint: str, participant: RosterEntry, fleet: str) -> None:
+    """Refuse a participant for which a router forwards nothing, by the roster in its folder; without one do nothing.
+
+    Raises:
+        BusError: the roster does not list the participant, is that of another fleet, or is damaged.
+    """
+    _, tls = identified(endpoint)
+    if tls is None or not (tls.folder / ROSTER).exists():
+        return
+    roster, path = read_roster(tls.folder), tls.folder / ROSTER
+    if participant.common_name not in {each.common_name for each in roster.participants}:
+        raise BusError(
+            f"'{participant.common_name}' is not in '{path}', so a router with this roster forwards none of its "
+            "messages: add it with thermofleet bus keys --add, or copy the roster of the router."
+        )
+    if fleet != roster.fleet:
+        raise BusError(
+            f"The certificates in '{tls.folder}' are for the fleet '{roster.fleet}', so a router forwards nothing of "
+            f"the fleet '{fleet}'. Give the fleet '{roster.fleet}', or certificates of '{fleet}'."
+        )
 
 
 def expires_at(endpoint: str) -> datetime | None:

@@ -134,8 +134,12 @@ class AsyncBridge:
         name = link.participant or monitor
         self._alarms, self._on_alarm = AlarmList(name, self._listener.view.alarms, kept, start_s=time.time()), on_alarm
         self._more_findings = more_findings
-        self._publish = link.publisher(keys.build(self.fleet, "monitor", "alarm", name), Alarm)
-        link.declare_token(keys.build(self.fleet, "monitor", "alive", name))
+        key = keys.build(self.fleet, "monitor", "alarm", name)
+        self._publish = link.publisher(key, Alarm, check=False)
+        if objection := link.objection("publish", key):
+            _LOG.warning("%s Only users of this gateway see its alarms.", objection)
+        else:
+            link.declare_token(keys.build(self.fleet, "monitor", "alive", name))
         link.watch_tokens(keys.of_every(self.fleet, "monitor", "alive"), self._monitor)
         self._check_s = time.monotonic() + FRESH_S  # by then it has heard from everybody who is there
         self._earlier = deque[FleetSnapshot](maxlen=3)

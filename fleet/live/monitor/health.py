@@ -11,6 +11,7 @@ from typing import Literal, get_args
 import msgspec
 
 from fleet.bus.protocol import keys
+from fleet.bus.protocol.operator import ALL_ARMS, by_whom
 from fleet.live.clock import FleetClock
 from fleet.live.monitor.snapshot import FRESH_S, SILENT_S, ArmSnapshot, FleetSnapshot
 
@@ -190,6 +191,7 @@ def check_fleet(
     return [
         *arms,
         *left_out,
+        *check_pauses(fleet),
         *check_awards(fleet),
         *check_jobs(fleet),
         *check_progress(fleet, earlier),
@@ -200,6 +202,19 @@ def check_fleet(
 def check_left_out(arm: str, why: str) -> Finding:
     """Return the finding of an arm that is awarded no jobs for a while."""
     return Finding("warning", f"{arm} {why}: it is awarded no job for a while. Its process may hang.")
+
+
+def check_pauses(fleet: FleetSnapshot) -> list[Finding]:
+    """Return the findings of the arms that people have paused, one of each person."""
+    arms: dict[str, list[str]] = {}
+    for arm, by in sorted(fleet.paused.items()):
+        arms.setdefault(by, []).append(arm)
+    return [Finding("note", f"{_paused(names)} paused{by_whom(by)}.") for by, names in arms.items()]
+
+
+def _paused(arms: Sequence[str]) -> str:
+    """Subject and verb for arms, or all."""
+    return "All arms are" if ALL_ARMS in arms else f"{', '.join(arms)} {'are' if arms[1:] else 'is'}"
 
 
 def check_connection(fleet: FleetSnapshot) -> list[Finding]:

@@ -54,10 +54,30 @@ def test_the_screen_shows_the_fleet():
     assert "a came" in told
 
 
-@given(arms=st.integers(0, 40), width=st.integers(60, 200), height=st.integers(8, 50), events=st.integers(0, 20))
-def test_the_screen_fits_the_terminal(arms, width, height, events):
+EXPIRY = "The certificate of 'monitor' expired on 2026-11-29 21:00 UTC, so it has no connection: renew it."
+
+
+def test_the_screen_tells_why_there_is_no_connection():
+    told = shown(replace(fleet_of([arm_now()]), lost_s=40.0, expiry=EXPIRY))
+    assert "no connection to the router for 40 s" in told
+    assert EXPIRY in " ".join(told.split())
+
+
+def test_the_screen_tells_who_has_paused_arms():
+    assert "All arms are paused by 'root'." in shown(replace(fleet_of([arm_now()]), paused={"*": "root"}))
+
+
+@given(
+    arms=st.integers(0, 40),
+    width=st.integers(60, 200),
+    height=st.integers(8, 50),
+    events=st.integers(0, 20),
+    expiry=st.sampled_from(["", EXPIRY, 9 * EXPIRY]),
+)
+def test_the_screen_fits_the_terminal(arms, width, height, events, expiry):
     names = [arm_now(f"arm_{number}", headroom_k=float(number), job="j" * 60) for number in range(arms)]
-    told = shown(fleet_of(names), width, height, ["an event " * 20] * events).splitlines()
+    fleet = replace(fleet_of(names), lost_s=40.0 if expiry else None, expiry=expiry)
+    told = shown(fleet, width, height, ["an event " * 20] * events).splitlines()
     assert len(told) <= height
     assert max(map(len, told)) <= width
 
