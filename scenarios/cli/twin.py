@@ -408,7 +408,7 @@ def train_command(
         out_console.print(quality_table(twin))
     if log is not None:
         count = card["twins"][0]["calibrated_on"]
-        alpha = f"verdicts with --alpha {1 / (count + 1):.2g} or more" if count else "no verdicts"
+        alpha = f"verdicts with --alpha {math.ceil(1e4 / (count + 1)) / 1e4:g} or more" if count else "no verdicts"
         say(f"Cool recordings held out (--hold-out): {count}, {alpha}; --alpha 0.05 needs 19.", out_console)
     say(f"Written to {out}; score with: thermofleet twin score {out}", out_console)
 

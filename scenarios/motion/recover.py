@@ -427,8 +427,10 @@ def hold_until(
     """True temperatures when the hottest motor reaches `until_c` in a hold from a cold start, °C, [node].
 
     Raises:
-        RecoveryError: it stays cooler.
+        RecoveryError: it stays cooler, or the air is warmer.
     """
+    if until_c <= ambient_c:
+        raise RecoveryError(f"A motor is never at {until_c:g} °C in air of {ambient_c:g} °C: give a warmer one.")
     temp_c = np.full(NODES, float(ambient_c))
     load = static_drive(ArmModel(arm.robot).gravity_torque(q, payload_kg), arm.motors)
     alike = {"motors": arm.motors, "thermal": arm.thermal, "start_c": temp_c, "ambient_c": ambient_c}
@@ -565,7 +567,7 @@ def save_generated(made: Generated, out: Path, *, overwrite: bool = False) -> No
     """
     with new_folder(out, GENERATED, overwrite=overwrite) as folder:
         for i, motion in enumerate(made.motions):
-            pq.write_table(motion_table(motion.plan), folder / f"motion_{i:03d}.parquet")
+            pq.write_table(motion_table(made.arm, motion.plan), folder / f"motion_{i:03d}.parquet")
         _write_card(generated_summary(made), folder / GENERATED.card)
 
 
@@ -584,18 +586,19 @@ def save_recovery(recovery: Recovery, out: Path, *, overwrite: bool = False) -> 
         _write_card(recovery_summary(recovery), folder / RECOVERY.card)
 
 
-def motion_table(plan: Plan) -> pa.Table:
-    """A plan as one row per sample: time_s, phase, payload_kg, q_1_rad …, qd_1_rad_s …, tau_1_nm …"""
+def motion_table(arm: str, plan: Plan) -> pa.Table:
+    """A plan as one row per sample, a log as telemetry.parquet is one: q_1 … rad, qd_1 … rad/s, tau_1 … N·m."""
     profile = np.concatenate([phase.profile for phase in plan.phases])
     lengths = [len(phase.profile) for phase in plan.phases]
     return pa.table(
         {
             "time_s": np.arange(len(profile)) / RATE_HZ,
+            "arm": [arm] * len(profile),
             "phase": np.repeat(PHASES, lengths),
             "payload_kg": np.concatenate([phase.payload_kg for phase in plan.phases]),
-            **_columns("q", "_rad", profile[:, 0]),
-            **_columns("qd", "_rad_s", profile[:, 1]),
-            **_columns("tau", "_nm", profile[:, 2]),
+            **_columns("q", "", profile[:, 0]),
+            **_columns("qd", "", profile[:, 1]),
+            **_columns("tau", "", profile[:, 2]),
         }
     )
 

@@ -574,7 +574,7 @@ def difficulty_chapter(subjects: Sequence[Subject], size: Size) -> Section:
             f"H{against}: {next(iter(by_name))} has AUROC {first}, RMS torque {torque}, the untrained network {other}.",
         ),
         how="d_k = 1 − exp(−e_k), e_k the mean absolute error of joint k summed over the channels; d is their sum with "
-        f"the weights of the twin. {len(subjects)} seeds, mean ± standard deviation; figure: the first.",
+        f"the weights of the twin. {_seeds(len(subjects))}",
         charts=_charts("difficulty", cells, x="", y=("d of the joint",), heads=("",), height=420),
         tables=(
             Table(head=("", *_joints(s), "d"), rows=tuple(rows)),
@@ -582,6 +582,10 @@ def difficulty_chapter(subjects: Sequence[Subject], size: Size) -> Section:
         ),
         numbers={"auroc": by_name},
     )
+
+
+def _seeds(count: int) -> str:
+    return "One seed." if count == 1 else f"{count} seeds, mean ± standard deviation; figure: the first."
 
 
 def epochs_chapter(subjects: Sequence[Subject], size: Size) -> Section:

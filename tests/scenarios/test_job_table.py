@@ -431,7 +431,11 @@ def test_jobs_that_cannot_finish_in_time_are_told(tmp_path, caplog, plans):
     table = small_table(tmp_path, f"{SHORT}\na,hold,bench,,,,1,,,\nb,hold,bench,,,,1,yes,,\nc,hold,bench,,,179,,,,\n")
     raw = tomllib.loads(SMALL) | {"name": "heat", "horizon_s": 10}
     raw["jobs"][1]["due_s"] = 0.5
-    for scenario in (table, parse_scenario(raw, tmp_path)):
+    late = raw | {
+        "name": "late",
+        "jobs": [raw["jobs"][0] | {"arrivals": {"kind": "batch", "count": 1, "start_s": 11.0}}],
+    }
+    for scenario in (table, parse_scenario(raw, tmp_path), parse_scenario(late, tmp_path)):
         prepare(scenario, difficulty="blind", cache=plans)
     assert [re.sub(r"[\d.]+ s \(", "… s (", each.message) for each in caplog.records] == [
         "cell.toml: 'jobs.csv', row 2, column due: 'a' takes at least … s (1 cycle), but has 1 s until it is due. Are "
@@ -442,6 +446,7 @@ def test_jobs_that_cannot_finish_in_time_are_told(tmp_path, caplog, plans):
         "minutes? Give seconds.",
         "heat.toml: jobs[1].due_s: 'sort' takes at least … s (1 cycle), but has 0.5 s until it is due. Are its times "
         "minutes? Give seconds.",
+        "late.toml: horizon_s: 'hold' takes at least … s (1 cycle), but has 0 s until the shift ends.",
     ]
 
 

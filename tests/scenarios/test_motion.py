@@ -19,6 +19,7 @@ from fleet.robot import GEN3, Robot
 from scenarios.motion.generate import GenerationError, bare_arm, generate, perform
 from scenarios.motion.recover import Candidate, Nearby, Recovery, Search, save_generated, save_recovery
 from scenarios.prepare.twins import cold_peaks
+from twin.logs.reader import read
 from twin.vae.generate import vary
 
 
@@ -144,8 +145,10 @@ def test_motion_is_read_back_with_its_units(made, tmp_path):
     for entry, motion in zip(card["motions"], made.motions, strict=True):
         table = pq.read_table(tmp_path / "out" / entry["file"])
         whole = np.concatenate([phase.profile for phase in motion.plan.phases])
-        for channel, pattern in enumerate(("q_{}_rad", "qd_{}_rad_s", "tau_{}_nm")):
-            columns = np.stack([table[pattern.format(j + 1)].to_numpy() for j in range(7)], axis=1)
+        (recording,) = read(tmp_path / "out" / entry["file"], measured=False)  # a log, as `twin score` reads it
+        assert recording.name.endswith(f"/{made.arm}")
+        for channel, name in enumerate(("q", "qd", "tau")):
+            columns = np.stack([table[f"{name}_{j + 1}"].to_numpy() for j in range(7)], axis=1)
             np.testing.assert_allclose(columns, whole[:, channel], rtol=1e-6)
         np.testing.assert_allclose(np.diff(table["time_s"].to_numpy()), 1 / RATE_HZ)
         phases = table["phase"].to_pylist()

@@ -233,6 +233,10 @@ WHOLE = {
         lambda: sound().plain().text([n if n == "time_s" else f"{n[:-1]}{int(n[-1]) - 1}" for n in PLAIN_NAMES]),
         "counted from 0: rename 'q_0' to 'q_1'",
     ),
+    "eight joints counted from 0": (
+        header(NAMES[0], *(f"{name[:-1]}{k}" for name in NAMES[1::7] for k in range(8))),
+        "has 8 joints; only logs of a Gen3",
+    ),
     "clock of the day": (
         lambda: "\n".join([",".join(NAMES), *(f"06:00:{n % 60:02d}" + ",1" * 35 for n in range(30)), ""]),
         "time is in seconds, or as 2026",

@@ -380,6 +380,8 @@ def _misnamed(layout: Format, names: Sequence[str]) -> str:
     """Sentence on columns that are those of a format but for units, case, or the number of the first joint."""
     required = layout.groups[: layout.required]
     wanted = [layout.time, *(column for group in required for column in layout.columns(group))]
+    if set(wanted) <= set(names):
+        return ""
     for shift, how in ((0, "with units or in another spelling"), (1, "counted from 1"), (-1, "counted from 0")):
         plain = {_plain(name, shift): name for name in names}
         known = [(plain[_plain(column)], column) for column in wanted if _plain(column) in plain]
@@ -429,8 +431,8 @@ def channels(layout: Format, groups: Sequence[str], table: LogTable) -> dict[str
     return readings
 
 
-ARM, MODE = "arm", "mode"
-"""Text columns: the arm's name and its mode."""
+ARM, UNREAD = "arm", ("mode", "phase", "payload_kg")
+"""The column of the arm, and those beside the readings that telemetry and generated motions have."""
 
 
 def read_arms(path: Path) -> dict[str, LogTable]:
@@ -453,7 +455,7 @@ def read_arms(path: Path) -> dict[str, LogTable]:
         )
     if not table.num_rows:
         raise LogError(str(path), None, "holds no rows.")
-    names = tuple(name for name in table.column_names if name not in (ARM, MODE))
+    names = tuple(name for name in table.column_names if name not in (ARM, *UNREAD))
     values = np.column_stack([_parquet_numbers(path, name, table[name]) for name in names])
     arms = np.array(table[ARM].cast(pa.string()).to_pylist(), dtype=object)
     if None in arms:
