@@ -111,7 +111,7 @@ def test_the_documented_command_recovers_an_arm(thermofleet, small_toml, subject
     for option, value, sentence in (
         ("--hold", 86_400, "--hold must be > 0 and at most 3600 (got 86400)"),
         ("--warm", 190, "does not get warm"),
-        ("--warm", 10, "A motor is never at 10 °C in air of 25 °C"),
+        ("--warm", 10, "A motor is never at 10 °C in air of 22 °C"),
         ("--network", tmp_path / "none", "No identified arm in"),
     ):
         assert thermofleet(*recover_left, option, value, "--out", tmp_path / "other").refused(sentence)
