@@ -165,7 +165,9 @@ def render(rows: Sequence[ScoreRow], how: str, *, caption: str) -> str | Table:
     if how == "csv":
         texts = (tuple(map(_csv_text, row.values())) for row in rows)
         return Table(head=tuple(heads), rows=tuple(texts)).csv()
-    omitted = (*OMITTED, *OMITTED_WITH_VERDICT) if "verdict" in heads else OMITTED
+    omitted = {*OMITTED, *(OMITTED_WITH_VERDICT if "verdict" in heads else ())}
+    if len({row.get("log") for row in rows}) > 1:
+        omitted.remove("log")
     shown = [head for head in heads if head not in omitted]
     return Table(
         head=tuple(Column(SHORT.get(head, head), words=isinstance(rows[0][head], str)) for head in shown),

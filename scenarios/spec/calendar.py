@@ -221,6 +221,12 @@ def check_breaks(scenario: Scenario, file: str) -> None:
                 f"{file}: breaks[{i}]: '{each.name}', {own}, lies outside the shift, {shift}: change its times, or "
                 "leave it out."
             )
+    long = [each for each in scenario.breaks if each.begin_s <= 0 and each.end_s >= scenario.horizon_s]
+    if all(any(arm in (each.arms or arms) for each in long) for arm in arms):
+        raise ScenarioError(
+            f"{file}: breaks: every arm has a break in the whole shift, {_span_text(scenario, 0.0, scenario.horizon_s)}"
+            ", so no job can be done: change the times of a break or of the shift."
+        )
     latest = dict[tuple[str, str], tuple[float, int]]()  # end and index, by name and arm
     for i, each in sorted(enumerate(scenario.breaks), key=lambda one: one[1].begin_s):
         for arm in each.arms or arms:

@@ -331,13 +331,16 @@ def _check(scenario: Scenario, path: Path) -> None:
                 f"{file}: arms[{j}].position_m: '{other.name}' is {apart:.2f} m from '{one.name}' (arms[{i}]); "
                 f"bases must be at least {APART_M} m apart."
             )
-    places = [place.name for place in scenario.places]
+    places = {place.name: place.position_m for place in scenario.places}
     streams = [stream.name for stream in scenario.jobs]
     rows, known_streams = {stream.name for stream in scenario.jobs if not stream.numbered}, frozenset(streams)
     for i, stream in enumerate(scenario.jobs):
         for name in chain.from_iterable(stream.alternatives):
             if name not in places:
                 faults.append(f"{stream.place_of(i, 'places')}: no place '{name}'{nearest(name, places)}")
+        for names in stream.alternatives:
+            if len({places.get(name, name) for name in names}) < len(set(names)):
+                faults.append(f"{stream.place_of(i, 'places')}: {' and '.join(names)} are at one point.")
         for name in stream.after:
             if name not in ({*streams[:i], *rows} if stream.numbered else known_streams):
                 known = nearest(name, streams[:i]) if i else "."

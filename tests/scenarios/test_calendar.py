@@ -145,6 +145,10 @@ BREAK = {"name": "lunch", "begin": "4:00", "end": "5:00"}
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
+        (
+            {"breaks": [BREAK | {"begin": "0:00", "end": "48:00"}]},
+            "breaks: every arm has a break in the whole shift, 0 to 172800 s, so no job can be done",
+        ),
         ({"breaks": [BREAK | {"end": "3:00"}]}, r"breaks\[0\].end_s must be after begin_s \(got 14400, 10800\)"),
         ({"breaks": [{"name": "lunch", "begin": "4:00"}]}, r"breaks\[0\]: 'end' is missing; a break has begin and end"),
         ({"breaks": [BREAK | {"begin": "noon"}]}, r"breaks\[0\]: expected seconds, h:mm, h:mm:ss, or a date"),

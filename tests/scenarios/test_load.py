@@ -109,6 +109,7 @@ WRONG = [
     (put("name", "../up"), "name must have 1 to 128 printable characters without / \\ [ ], and no dot or space at the"),
     (put("jobs", 0, "places", ["bnch"]), "jobs[0].places: no place 'bnch'; did you mean 'bench'? Allowed: bench,"),
     (put("jobs", 1, "places", ["bench"]), "jobs[1].places must be two different places, from and to, for a sort (g"),
+    (put("places", 1, "position_m", [0.0, 0.2, 0.25]), "jobs[1].places: shelf and bench are at one point."),
     (put("jobs", 0, "places", ["bench", ["shelf"]]), "jobs[0].places must be names, or lists of names (got ['bench', "),
     (put("jobs", 0, "places", [["bench"], ["bench"]]), "jobs[0].places must name each alternative once (got [('bench"),
     (put("jobs", 0, "places", [["bench"], ["shlf"]]), "jobs[0].places: no place 'shlf'; did you mean 'shelf'?"),

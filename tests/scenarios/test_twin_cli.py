@@ -61,7 +61,7 @@ def twins(trained, tmp_path):
     return shutil.copytree(trained, tmp_path / "twins")
 
 
-def test_a_log_becomes_a_twin_that_finds_threefold_torque_harder(thermofleet, twins, logs):
+def test_a_log_becomes_a_twin_that_finds_threefold_torque_harder(thermofleet, twins, logs, tmp_path):
     card = json.loads((twins / "twins.json").read_text(encoding="utf-8"))
     assert card["status"] == "finished"
     mean_d, mean_load = {}, {}
@@ -79,6 +79,11 @@ def test_a_log_becomes_a_twin_that_finds_threefold_torque_harder(thermofleet, tw
     said = thermofleet("twin", "score", twins, "--log", logs / "hot.csv")
     assert f"version {card['twins'][0]['version']}" in " ".join(said.out.split())
     assert "…" not in said.out  # everything fits into 80 columns
+    assert "hot.csv" not in said.out
+    for name in ("cool/monday.csv", "hot.csv"):
+        shutil.copy(logs / name, tmp_path)
+    said = thermofleet("twin", "score", twins, "--log", tmp_path)
+    assert {"monday", "hot"} <= set(said.out.split())  # of several recordings each row names its own
     assert mean_d["hot.csv"] > mean_d["cool/monday.csv"]
     assert mean_load["hot.csv"] > 2 * mean_load["cool/monday.csv"]
 
