@@ -182,14 +182,17 @@ Endpoint = Callable[[Request], Awaitable[Response]]
 NO_TOKENS: Mapping[str, Role] = {}
 
 
-def check_token(token: str) -> str:
+def check_token(token: str, where: str = "") -> str:
     """Return the token.
+
+    Args:
+        where: Begin of the error.
 
     Raises:
         FleetError: it is too short, or has other characters than printable ASCII.
     """
     if len(token) < MIN_TOKEN or not token.isascii() or not token.isprintable():
-        raise FleetError(f"A token needs {MIN_TOKEN} or more printable ASCII characters (got {len(token)}).")
+        raise FleetError(f"{where}A token needs {MIN_TOKEN} or more printable ASCII characters (got {len(token)}).")
     return token
 
 
@@ -210,11 +213,11 @@ def read_tokens(path: Path) -> dict[str, Role]:
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.startswith("#"):
             continue
-        name, _, token = line.strip().partition(" ")
+        name, *rest = line.split(maxsplit=1)
         role: Role | None = next((role for role in ROLES if role == name), None)
         if role is None:
             raise FleetError(f"{path}, line {number}: no role '{name}'{nearest(name, ROLES)}")
-        token = check_token(token.strip())
+        token = check_token("".join(rest).strip(), f"{path}, line {number}: ")
         if token in tokens:
             raise FleetError(
                 f"{path}, lines {first[token]} and {number}: the same token. Write a token in one line only."
