@@ -347,7 +347,11 @@ def test_with_a_token_any_address_is_allowed_with_a_warning(caplog):
         ("operater sixteen-or-more-characters", 0o600, "line 1: no role 'operater'; did you mean 'operator'?"),
         ("# nothing", 0o600, "has no tokens"),
         (f"monitor {TOKEN}\n\noperator\t{TOKEN}", 0o600, "tokens, lines 1 and 3: the same token."),
-        ("# mine\nmonitor short", 0o600, "tokens, line 2: A token needs 16 or more printable ASCII characters (got 5)."),
+        (
+            "# mine\nmonitor short",
+            0o600,
+            "tokens, line 2: A token needs 16 or more printable ASCII characters (got 5).",
+        ),
     ],
 )
 def test_a_file_of_tokens_says_what_is_wrong_with_it(tmp_path, content, mode, says):
