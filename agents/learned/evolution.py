@@ -132,7 +132,10 @@ class TrainingLog:
 def read_log(folder: Path) -> list[dict[str, Any]]:
     """The rows of a training, oldest first, without damaged lines, as a power cut leaves one; none without a file."""
     rows = list[dict[str, Any]]()
-    for line in (folder / LOG).read_bytes().splitlines() if (folder / LOG).is_file() else ():
+    path = folder / LOG
+    for line in path.read_bytes().splitlines() if path.is_file() else ():
         with suppress(ValueError):
-            rows += [row] if isinstance(row := json.loads(line), dict) else []
+            row = json.loads(line)
+            if isinstance(row, dict):
+                rows.append(row)
     return rows

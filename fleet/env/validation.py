@@ -85,8 +85,8 @@ def actions_of(agents: Sequence[str], actions: object) -> np.ndarray:
     """
     if not isinstance(actions, Mapping):
         raise ValueError(f"step() takes a dictionary of agents and their actions (got {actions!r}).")
-    if not actions.keys() <= set(agents):
-        agent_of(agents, min(set(actions) - set(agents), key=str))
+    if unknown := actions.keys() - set(agents):
+        agent_of(agents, min(unknown, key=str))
     return np.array([_integer(agent, actions.get(agent, 0)) for agent in agents], dtype=np.int64)
 
 
@@ -103,8 +103,6 @@ def agent_of(agents: Sequence[str], agent: object) -> str:
 
 def _integer(agent: str, action: object) -> int:
     """One integer; one beyond 64 bits becomes an action that no action space has, so the agent waits."""
-    if type(action) is int and -_LARGEST < action < _LARGEST:
-        return action
     if type(action) is not int:
         value = np.asarray(action)
         if value.size == 1 and np.issubdtype(value.dtype, np.integer):

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 Algorithm = Literal["mappo", "ippo"]
 TrainingSplit = Literal["train"]
 """The other splits are for validation and for results."""
-_OF_NETWORKS = (*("algo", "randomise", "warm_start", "envs", "decisions", "entropy", "discount_hours", "threads"),)
+_OF_NETWORKS = ("algo", "randomise", "warm_start", "envs", "decisions", "entropy", "discount_hours", "threads")
 """Options of `train` for networks alone."""
 BoardSplit = Literal["test", "validation"]
 PAGE = "index.html"

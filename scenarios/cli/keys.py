@@ -5,6 +5,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import get_args
 
+import typer
+
 from fleet.bus.security.access_control import ROLES, Role, Roster, RosterEntry, of_arms, read_roster, rights
 from fleet.errors import FleetError, nearest
 from fleet.fields import argument, option
@@ -17,13 +19,14 @@ _ROLES = ", ".join(ROLES)
 
 
 def keys_command(
+    ctx: typer.Context,
     folder: Path = argument("Folder of one fleet's keys.", metavar="DIR"),
     scenario: str | None = argument(
         "Make new keys for the arms of this scenario. Default: show the present keys.", None
     ),
     extra: list[str] | None = option(f"NAME:ROLE, another participant; roles: {_ROLES}.", None),
     add: list[str] | None = option("NAME:ROLE, a new certificate from the present authority.", None),
-    days: int | None = option(f"Lifetime of the new certificates, days. Default: {DAYS}.", None, low=1, high=MAX_DAYS),
+    days: int = option("Lifetime of the new certificates, days.", DAYS, low=1, high=MAX_DAYS),
     host: list[str] | None = option(
         "Name or address of the router, besides localhost, 127.0.0.1 and ::1; may be repeated.", None
     ),
@@ -37,23 +40,16 @@ def keys_command(
 
     if add and (scenario or extra or no_auctioneer):
         raise FleetError("--add extends the present keys; leave SCENARIO, --extra and --no-auctioneer out.")
-    if not (scenario or add):
-        for_new_keys = {
-            "--extra": extra,
-            "--days": days,
-            "--host": host,
-            "--overwrite": overwrite,
-            "--no-auctioneer": no_auctioneer,
-        }
-        if given := [flag for flag, value in for_new_keys.items() if value]:
-            raise FleetError(
-                f"{given[0]} is for new keys. Give SCENARIO to make all keys (with --overwrite, to replace all), or "
-                "--add NAME:ROLE to extend the present ones."
-            )
+    needless = options.first_given(ctx, "extra", "days", "host", "overwrite", "no_auctioneer")
+    if needless and not (scenario or add):
+        raise FleetError(
+            f"{needless} is for new keys. Give SCENARIO to make all keys (with --overwrite, to replace all), or "
+            "--add NAME:ROLE to extend the present ones."
+        )
     added = [participant_of(text) for text in add or ()]
     if host and added and not any(one.role == "router" for one in added):
         raise FleetError("--host is for the certificate of a router, and --add names none; leave --host out.")
-    lifetime, hosts = days or DAYS, host or HERE
+    hosts = host or HERE
     if scenario:
         from scenarios.spec.load import load
 
@@ -63,9 +59,9 @@ def keys_command(
             roster = of_arms(chosen.name, [arm.name for arm in chosen.arms], more, auctioneer=not no_auctioneer)
         except ValueError as error:
             raise FleetError(str(error)) from error
-        make(folder, roster, days=lifetime, hosts=hosts, overwrite=overwrite)
+        make(folder, roster, days=days, hosts=hosts, overwrite=overwrite)
     if added:
-        add_to(folder, added, days=lifetime, hosts=hosts, overwrite=overwrite)
+        add_to(folder, added, days=days, hosts=hosts, overwrite=overwrite)
     roster = read_roster(folder)
     spans = lifetimes(folder, roster)
     if as_json:

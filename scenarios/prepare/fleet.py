@@ -226,7 +226,7 @@ def unfinishable_jobs(scenario: Scenario, arms: Sequence[PlannedArm]) -> Iterato
         if stream.due == "soft" and stream.due_s < left_s:  # a hard job must only begin before it is due
             left_s, place, until = stream.due_s, stream.place_of(i, "due" if stream.row else "due_s"), "it is due"
         needed_s = least_s(works_of(scenario, stream), cycles)
-        if (left_s < 0 and spec.times_s) or needed_s <= left_s:  # times outside the shift are told when it is read
+        if (left_s < 0 and spec.times_s) or needed_s <= left_s:  # parsing reports times outside the shift
             continue
         left_s = max(left_s, 0.0)
         unit = next((name for name, s in (("minutes", 60.0), ("hours", 3600.0)) if s * left_s >= needed_s), "")

@@ -158,11 +158,13 @@ def expires_at(endpoint: str) -> datetime | None:
     return None if certificate is None else certificate.not_valid_after_utc
 
 
+UNKNOWN_CERTIFICATE = " Or the router does not know this certificate: it reads its roster when it starts."
+"""Another cause of a fleet that seems to be empty, as a sentence after a space."""
+
+
 def unknown_certificate_hint(endpoint: str) -> str:
-    """Another cause of a fleet that seems to be empty, as a sentence after a space; "" without TLS."""
-    if identified(endpoint)[1] is None:
-        return ""
-    return " Or the router does not know this certificate: it reads its roster when it starts."
+    """`UNKNOWN_CERTIFICATE`; "" without TLS."""
+    return "" if identified(endpoint)[1] is None else UNKNOWN_CERTIFICATE
 
 
 def _certificate_at(endpoint: str) -> "x509.Certificate | None":

@@ -163,14 +163,12 @@ class ConsensusNode(JobDesk):
         granter, number = self.participant.granter, self._first_number
         check_journals(self._name, number, self._epoch, histories, new_epoch=self._new_epoch)
         known = max((history.claims.get(self._name, -1) for history in histories), default=-1)
-        epochs = [history.epoch for history in histories if history.epoch]
         if known >= number or (known >= 0 and not self._epoch):
             _LOG.warning("Arm '%s' adopts what %d arm(s) have done and have.", self._name, len(histories))
             for history in (each for each in histories if each.arm != self._name):
                 granter.adopt(adopted(self.book, history), time.monotonic())
             self.participant.count_after(known)
-        if epochs and not self._epoch:
-            self._take_epoch(epochs[0])
+        self._take_epoch(next((history.epoch for history in histories if history.epoch), ""))
 
     def _ask_peers(self, real_s: float) -> None:
         """Ask all peers what they know, before this arm takes or names an epoch."""

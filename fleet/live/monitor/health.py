@@ -12,6 +12,7 @@ import msgspec
 
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.operator import ALL_ARMS, by_whom
+from fleet.bus.security.tls import UNKNOWN_CERTIFICATE
 from fleet.live.clock import FleetClock
 from fleet.live.monitor.snapshot import FRESH_S, SILENT_S, ArmSnapshot, FleetSnapshot
 
@@ -147,7 +148,7 @@ def check_health(
         findings.append(Finding("fault", f"Not present: {', '.join(missing)}."))
     if not any(arm.present for arm in fleet.arms):
         unheard = secure and not any(arm.token for arm in fleet.arms)
-        hint = " Or the router does not know this certificate: it reads its roster when it starts." if unheard else ""
+        hint = UNKNOWN_CERTIFICATE if unheard else ""
         findings.append(Finding("fault", f"No arm is present: none shows both a token and a fresh state.{hint}"))
     if trips_s and median(trips_s) > SLOW_S:
         findings.append(Finding("warning", f"The router is slow: a round trip takes {1000 * median(trips_s):.0f} ms."))
