@@ -24,7 +24,7 @@ from fleet.live.arm.node import ArmNode
 from fleet.live.book import JobBook
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Granter
-from fleet.live.consensus.participant import QUIET_S, Membership, Participant
+from fleet.live.consensus.participant import Membership, Participant
 from fleet.live.desk import JobDesk
 from fleet.live.epochs import REPLY_S, adopted, ask_arms, check_journals, history_of
 from fleet.live.job_rules import SHIFT_ENDED
@@ -205,8 +205,7 @@ class ConsensusNode(JobDesk):
             self.participant.tick(real_s, time_s)
             self._send()
             self._recorder.step(real_s, time_s)
-        quiet_s = self.participant.changed_s + QUIET_S
-        self.wake_s = quiet_s if quiet_s > real_s else math.inf
+        self.wake_s = self.participant.wake_s(real_s)
 
     def _offer_jobs(self, time_s: float) -> None:
         """Add the jobs of the stream that are due, as many as the disk has space for."""

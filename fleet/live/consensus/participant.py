@@ -87,7 +87,6 @@ class Participant:
         states: The last state of each arm, with its last possible temperatures.
         out: Bids, claims and requests of people that were carried out; the driver sends them.
         rounds: Number of choices of its policy.
-        changed_s: Real second of the last change of a bid or choice.
     """
 
     def __init__(self, arm: ArmNode, granter: Granter, membership: Membership, *, boot: int, rng: Random) -> None:
@@ -111,7 +110,9 @@ class Participant:
         self._bids: dict[str, tuple[Bid, float]] = {}
         """Last bid of each arm, and its real second."""
         self._present: frozenset[str] = frozenset()
-        self._bid_s = self._chosen_s = self.changed_s = -math.inf
+        self._bid_s = self._chosen_s = self._changed_s = -math.inf
+        self._waiting_s = math.inf
+        """Real second since which its next choice waits for bids of its peers; inf if it does not."""
         self._last_bid: object = None
         """Content of the last bid, without the costs."""
         self._choice = NO_CHOICE
@@ -149,9 +150,9 @@ class Participant:
         self._bids[bid.arm] = bid, real_s
         self._note_offers(bid)
         if before is None or _offered(before[0]) != _offered(bid):
-            self.changed_s, self._new_bids = real_s, True
+            self._changed_s, self._new_bids = real_s, True
         elif (before[0].choice, before[0].choice_plan) != (bid.choice, bid.choice_plan):
-            self.changed_s = real_s
+            self._changed_s = real_s
         if bid.arm != self.name:
             self._send_corrections(bid, real_s)
 
@@ -219,6 +220,13 @@ class Participant:
             self._choose(real_s, time_s)
         if claim := self.claimant.claim(self._present, self._arm.space, real_s):
             self.out.append(claim)
+
+    def wake_s(self, real_s: float) -> float:
+        """Return the next real second at which a bid, a choice or a claim is due without a message; inf for none."""
+        window_s = self._timing.window_s
+        chosen_s = self._chosen_s if self._choice.job else math.inf
+        due_s = (self._bid_s + BID_S, self._changed_s + QUIET_S, self._waiting_s + window_s, chosen_s + window_s)
+        return min((each for each in due_s if each > real_s), default=math.inf)
 
     def _obey(self, real_s: float) -> None:
         """Apply operator requests to uncommitted jobs, end leases, and give up jobs that have expired."""
@@ -341,16 +349,19 @@ class Participant:
         own = self._bids[self.name][0]
         due = self._new_bids or real_s >= self._chosen_s + BID_S
         if not (own.capacity and own.estimates and due) or self.claimant.pending or self.claimant.capacity < 1:
+            self._waiting_s = math.inf
             return
         bids = self._fresh_bids(real_s)
         if len(bids) < self.claimant.majority:
             return
         mine = {offer.job for offer in own.estimates}
         behind = any(not mine <= {offer.job for offer in bid.estimates} for bid in bids.values())
-        early = self._present - bids.keys() or behind or real_s < self.changed_s + QUIET_S
-        if early and real_s < self._bid_s + self._timing.window_s:
+        early = self._present - bids.keys() or behind or real_s < self._changed_s + QUIET_S
+        self._waiting_s = min(self._waiting_s, real_s)
+        if early and real_s < self._waiting_s + self._timing.window_s:
             return
         self._new_bids, self._chosen_s, self.rounds = False, real_s, self.rounds + 1
+        self._waiting_s = math.inf
         bidding = self._bidding(bids, [offer.job for offer in own.estimates])
         observations = observe(bidding, self._fleet, last={self.name: -1} if self._lost else {})
         action = self._policy(observations[self.name], self._fleet.arms.index(self.name))
@@ -365,7 +376,7 @@ class Participant:
 
     def _claim_choice(self, real_s: float) -> None:
         """Claim the chosen job once the choices of the peers have arrived, unless another arm's excludes it."""
-        if real_s < self.changed_s + QUIET_S and real_s < self._chosen_s + self._timing.window_s:
+        if real_s < self._changed_s + QUIET_S and real_s < self._chosen_s + self._timing.window_s:
             return
         bids = self._fresh_bids(real_s)
         choices = {arm: Choice(bid.choice, bid.choice_plan) for arm, bid in bids.items() if bid.choice}
