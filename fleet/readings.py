@@ -362,7 +362,8 @@ _WITHOUT = {
 def _stuck(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]:
     """Sensors that repeat one reading while those of the other joints change, or while the arm moves.
 
-    The temperatures of all joints may repeat for some minutes, as sensors with whole degrees do.
+    The temperatures of all joints may repeat for some minutes, as sensors with whole degrees do; if they are equal, or
+    the arm moves for long, they may not.
     """
     works = (np.diff(readings["tau"], axis=0) != 0).any(axis=1)
     moved = np.abs(_steps(readings["q"])).sum(axis=1)
@@ -384,9 +385,11 @@ def _stuck(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]
                     alive = np.abs(readings["qd"][a:b, j]).mean() > DRIVES_RAD_S
                 elif channel != "temp_c":
                     alive |= moved[a:b].sum() > LEAST_MOTION_RAD
-                elif span_s >= 10 * STUCK_S:
+                elif span_s >= 4 * STUCK_S and not changes[a:b].any():
+                    alike = not np.ptp(readings[channel][a])  # a placeholder
+                    fine = value % 1 != 0 and span_s >= 10 * STUCK_S
                     moves = moved[a:b].sum() > 10 * LEAST_MOTION_RAD and works[a:b].mean() >= 0.5
-                    alive |= value % 1 != 0 and not changes[a:b].any() and moves
+                    alive |= (alike or fine) and moves
                 if not never and not (alive and span_s >= STUCK_S):
                     continue
                 stands = "never changes, but its velocity does" if channel == "q" else f"is {value:.5g}"

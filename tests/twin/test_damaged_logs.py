@@ -205,6 +205,7 @@ WHOLE = {
         lambda: sound().text().replace(",", "\t").replace(".", ","),
         "no good line of numbers.*decimal comma",
     ),
+    "a placeholder for all temperatures": (changed("Temp", lambda v: np.full_like(v, 25.0)), "joint 1 is 25, for 14"),
     "no temperatures": (changed("Temp", np.zeros_like), "temperature of joint 1 is 0, for 14"),
     "degrees as rad": (plainly(scaled("Pos", TURN)), "Are these degrees"),
     "angles from 0 to 2π": (
@@ -430,7 +431,7 @@ def test_coarse_recorders_and_slow_ones_are_not_refused(channel: str, digits: in
     time_s = np.arange(0.0, 900.0, 0.5)
     q = 0.4 * np.sin(np.outer(time_s, 0.1 * np.arange(1, 8)) + np.arange(7))
     tau = gravity_terms(q)[:, :, 2] + 0.1 * np.cos(q)
-    readings = {"q": q, "qd": np.gradient(q, time_s, axis=0), "tau": tau, "temp_c": 31.0 + 0.2 * np.sin(q)}
+    readings = {"q": q, "qd": np.gradient(q, time_s, axis=0), "tau": tau, "temp_c": 31.0 + np.arange(7) + 0.2 * np.sin(q)}
     readings["current_a"] = 0.1 * readings["tau"]
     readings[channel] = readings[channel].round(digits)
     assert judge(time_s, readings, degrees=False) == []
