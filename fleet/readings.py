@@ -69,9 +69,10 @@ BACK = 0.05
 """Share of lines across which an angle jumps back, from which a log has two arms; the public logs have none."""
 SLOW_RAD_S = 0.2
 """Speed up to which gravity causes most of the torque."""
-UNHELD, UNHELD_NM = 0.35, 0.8
+UNHELD, UNHELD_NM = 0.25, 0.8
 """Share of the squared torque, and RMS torque, that no mount and payload of a Gen3 leave unexplained. The public logs
-have a share of at most 0.11; with a tenth of their torque it is at least 0.5."""
+have a share of at most 0.11; with 8.85 times their torque (lbf·in) it is at least 0.26, with a tenth 0.5, except that
+of a joint turning alone."""
 MOST_PAYLOAD_KG = 5.0
 """Largest payload with which torques are explained."""
 
@@ -626,9 +627,9 @@ def unheld(readings: Mapping[str, Array]) -> list[BadReading]:
         return []
     rms_nm = np.sqrt((tau**2).mean())
     what = f"the torques, {rms_nm:.3g} N·m RMS, do not hold the arm: in every mount, gravity needs others"
-    tenfold_fits = _unexplained([(q, 9.81 * tau)]) < UNHELD
-    guess = "Are these kgf·m, or currents in A? " if tenfold_fits else "Was the torque measured? "
-    return [BadReading(what, f"{guess}Give N·m.")]
+    meant = {"kgf·m, or currents in A": 9.81, "lbf·in or kgf·cm": 0.1}
+    fits = [f"Are these {unit}? " for unit, factor in meant.items() if _unexplained([(q, factor * tau)]) < UNHELD]
+    return [BadReading(what, f"{(*fits, 'Was the torque measured? ')[0]}Give N·m.")]
 
 
 def mounts_differ(*several: Mapping[str, Array]) -> bool:

@@ -431,7 +431,12 @@ def test_coarse_recorders_and_slow_ones_are_not_refused(channel: str, digits: in
     time_s = np.arange(0.0, 900.0, 0.5)
     q = 0.4 * np.sin(np.outer(time_s, 0.1 * np.arange(1, 8)) + np.arange(7))
     tau = gravity_terms(q)[:, :, 2] + 0.1 * np.cos(q)
-    readings = {"q": q, "qd": np.gradient(q, time_s, axis=0), "tau": tau, "temp_c": 31.0 + np.arange(7) + 0.2 * np.sin(q)}
+    readings = {
+        "q": q,
+        "qd": np.gradient(q, time_s, axis=0),
+        "tau": tau,
+        "temp_c": 31.0 + np.arange(7) + 0.2 * np.sin(q),
+    }
     readings["current_a"] = 0.1 * readings["tau"]
     readings[channel] = readings[channel].round(digits)
     assert judge(time_s, readings, degrees=False) == []
@@ -475,6 +480,7 @@ UNHELD: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
     "zero": (lambda tau: 0.0 * tau, "Was the torque measured?"),
     "kgf·m": (lambda tau: tau / 9.81, "Are these kgf·m"),
     "amperes": (lambda tau: tau / TORQUE_PER_AMP, "currents in A"),
+    "lbf·in": (lambda tau: 8.85 * tau, "Are these lbf·in"),
     "noise": (lambda tau: np.random.default_rng(0).normal(0.0, 3.0, tau.shape), "Was the torque measured?"),
 }
 
