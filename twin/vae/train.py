@@ -362,16 +362,17 @@ def train(
         seeds = [[_child(seed, n, restart) for restart in range(config.restarts)] for n in range(len(names))]
         results = _best_of(x, torch.from_numpy(noise), config, seeds, report)
     still = [bool(part.all()) for part in np.split(scaler.still, len(names))]
-    checked = [_checked(*each, arm, config) for each in zip(names, results, still, strict=True)]
+    amount = f"{len(windows)} windows from {sum(map(len, records)) / config.record_hz:.0f} s of motion"
+    checked = [_checked(*each, arm, config, amount) for each in zip(names, results, still, strict=True)]
     fits, nets = zip(*checked, strict=True)
     data_hash = hash_records(records)
     return Twin(config, scaler, list(nets), arm=arm, data_hash=data_hash, seed=seed_text(seed), fits=fits)
 
 
 def _checked(
-    name: str, result: tuple[Fit, Weights] | None, is_still: bool, arm: str, config: TwinConfig
+    name: str, result: tuple[Fit, Weights] | None, is_still: bool, arm: str, config: TwinConfig, amount: str
 ) -> tuple[Fit, Weights]:
-    """Fit and weights of a network of this name; raises as `train`."""
+    """Fit and weights of a network of this name, trained on some amount of motion; raises as `train`."""
     label = "the whole arm" if name == "arm" else name.replace("_", " ")
     if result is None:
         raise Diverged(f"The training of {label} of '{arm}' ended without finite weights. Lower learning_rate or clip.")
@@ -380,8 +381,8 @@ def _checked(
     if collapsed(kl_nats, fit.active_units) and not (config.allow_collapse or is_still):
         raise CollapsedPosterior(
             f"Posterior collapse of {label} in the twin of '{arm}': KL {fit.kl:.2f} nat, {fit.active_units} active "
-            "latent unit(s). Lower beta, train longer (epochs, max_windows), or set allow_collapse to keep it as a "
-            "baseline."
+            f"latent unit(s), trained on {amount}. Some minutes of varied motion are needed; with enough of it, lower "
+            "beta or train longer (epochs, max_windows). To keep it as a baseline, set allow_collapse."
         )
     return result
 
