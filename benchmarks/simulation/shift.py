@@ -1,7 +1,8 @@
 """One simulated life of a fleet: jobs and faults by one seed, rules after every event, and all settled at the end.
 
 Rules besides those of `simulated_fleet`: after the faults every job is finished, given up for the reasons that the
-product names, or unfinished because an arm stopped in its last cycle; every wait ends, and has a stated reason;
+product names, or unfinished because an arm stopped in its last cycle; every wait ends, and has a stated reason; no
+job that could begin waits for long while all arms are idle;
 arms that are idle at home take no space; requests of people have their effect (`steering`); the recording has every
 result once (`recording`).
 """
@@ -40,6 +41,8 @@ MOST_JOBS = 60
 """In one shift, about."""
 CHECK_S = 2.0
 """True seconds between two checks whether all is settled."""
+IDLE_S = 3.0
+"""True seconds after the faults in which a job begins if one can and all arms are idle."""
 RECORD_S = 120.0
 """True seconds after the last result in which the recorder has it."""
 FREE_S = 60.0
@@ -68,6 +71,8 @@ class Shift(Fleet):
         """Jobs that a person has asked to cancel."""
         self.redone: set[str] = set()
         """Jobs that a person has asked to redo before their last cycle was begun."""
+        self.broken_off: set[str] = set()
+        """Jobs of which an arm broke the last cycle off."""
         self.work_s = 0.0
         self.healed = False
         self.jobs: list[JobSpec] = []
@@ -102,11 +107,23 @@ class Shift(Fleet):
             self._end_recording()
 
     def begins_last_cycle(self, arm: str, job: str) -> None:
-        """Check as a fleet does. The arm breaks down if a person has asked to redo the job."""
+        """Check as a fleet does. The arm breaks down if a person has asked to redo the job.
+
+        It may begin again what it broke off when a person moved it home and did not stop its process: that was no
+        second time, as it breaks down at once.
+        """
         super().begins_last_cycle(arm, job)
         if job in self.redone and not self.healed:
             self.redone.discard(job)
+            if job in self.broken_off:
+                self.unsure.add(job)
+                super().breaks_last_cycle_off(arm, job)
             self.world.after(0.0, _break_down, self, self.world.processes[arm])
+
+    def breaks_last_cycle_off(self, arm: str, job: str) -> None:
+        """Note that a last cycle was certainly not done."""
+        super().breaks_last_cycle_off(arm, job)
+        self.broken_off.add(job)
 
     def _submit(self) -> None:
         rng, names = self.rng, [job.name for job in self.jobs]
@@ -200,14 +217,33 @@ class Shift(Fleet):
         nodes = (node for name in self.arms if (node := self.node(name)) is not None)
         return any(node.work_source.book.operations.paused for node in nodes)
 
+    def _is_idle(self) -> bool:
+        """Whether all processes are up, and no arm has a job, is away or cannot work."""
+        if self._is_paused() or self.submitter.waiting or any(self.node(name) is None for name in self.names):
+            return False
+        nodes = [self.node(name) for name in self.arms]
+        return not (self.away or any(node.executor.active or node.unfit() for node in nodes))
+
+    def _ready(self) -> list[str]:
+        """Jobs that wait for no other job; the first arm can do all of them."""
+        states = self.statuses()
+        waiting = (job for name, job in self.submitter.accepted.items() if states.get(name) == "waiting")
+        return [job.name for job in waiting if all(states.get(before) == "finished" for before in job.after)]
+
     def _settle(self) -> None:
         deadline_s = self.world.now_s + SETTLE_S + 3.0 * self.work_s
+        idle_s = self.world.now_s
         while self._open():
             if self.world.now_s > deadline_s:
                 raise Violation(f"No end after {self.world.now_s:.0f} s: {'; '.join(self._open()[:4])}.")
             if self._is_paused():
                 request(self, Resume())
-            self.world.run(self.world.now_s + CHECK_S)
+            self.world.run(self.world.now_s + CHECK_S / 4)
+            if not (self._is_idle() and (jobs := self._ready())):
+                idle_s = self.world.now_s
+            elif self.world.now_s > (since_s := max(idle_s, self.departed_s)) + IDLE_S:
+                idle_for_s = self.world.now_s - since_s
+                raise Violation(f"'{jobs[0]}' could begin, and all arms are idle for {idle_for_s:.1f} s.")
         self.unsure |= {job for builder in self.builders.values() for job in builder.unsure}
         states = self.statuses()
         results = [each.status for each in self.sent.messages.values() if isinstance(each, Result)]

@@ -70,6 +70,7 @@ class Fleet:
         begun: How many times the last cycle of a job was begun and not broken off.
         finished: How many times the last cycle of a job ended.
         away: Plan of each arm that is away from home.
+        departed_s: True second at which an arm has left home last.
         unsure: Jobs whose arm stopped in the last cycle.
         sent: What the participants have published.
     """
@@ -92,6 +93,7 @@ class Fleet:
         self.begun: dict[str, int] = {}
         self.finished: dict[str, int] = {}
         self.away: dict[str, str] = {}
+        self.departed_s = 0.0
         self.unsure: set[str] = set()
         membership: Membership | None = None
         if alone:
@@ -148,7 +150,7 @@ class Fleet:
         for other, taken in self.away.items():
             if other != arm and self.excludes(arm, space, other, taken):
                 raise Violation(f"'{arm}' leaves home on {space} while '{other}' is away on {taken}.")
-        self.away[arm] = space
+        self.away[arm], self.departed_s = space, self.world.now_s
 
     def is_home(self, arm: str) -> None:
         """Note that an arm is at home."""
