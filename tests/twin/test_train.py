@@ -252,7 +252,7 @@ def test_more_windows_than_wanted_are_drawn_without_bias(records, tiny):
 
 def test_a_collapsed_posterior_is_an_error_with_advice(records, small):
     drowned = replace(small, beta=1000.0, epochs=8, max_windows=128)
-    with pytest.raises(CollapsedPosterior, match="from .* s of motion.* lower beta") as caught:
+    with pytest.raises(CollapsedPosterior, match=r"from .* s of motion.* lower beta") as caught:
         train(records, drowned, SEED, arm="arm_3")
     assert isinstance(caught.value, FleetError)
     assert "arm_3" in str(caught.value)
