@@ -280,14 +280,21 @@ class JobBook(TimedState[BookRecord]):
             time_s=time_s,
         )
 
-    def ready(self, time_s: float, limit: int, *, excluded: Container[str] = ()) -> list[JobSpec]:
+    def ready(
+        self,
+        time_s: float,
+        limit: int,
+        *,
+        excluded: Container[str] = (),
+        rank: Callable[[str], int] = lambda job: 0,
+    ) -> list[JobSpec]:
         """Return the jobs that wait for an arm, as `ready_jobs` does."""
         if self.ended:
             return []
         waiting = [entry for name, entry in self.waiting.items() if name not in excluded]
         returned_s = {entry.name: entry.returned_s for entry in waiting if entry.returns}
         specs = (entry.spec for entry in waiting if entry.spec is not None)
-        return ready_jobs(specs, time_s, limit, self.busy_stations(), self.is_finished, returned_s)
+        return ready_jobs(specs, time_s, limit, self.busy_stations(), self.is_finished, returned_s, rank)
 
     def is_finished(self, name: str) -> bool:
         """Return whether a job is finished.

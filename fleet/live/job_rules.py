@@ -263,6 +263,7 @@ def ready_jobs(
     busy: frozenset[str],
     finished: Callable[[str], bool],
     returned_s: Mapping[str, float],
+    rank: Callable[[str], int] = lambda job: 0,
 ) -> list[JobSpec]:
     """Return the jobs that wait for an arm, as they queue: released, predecessors finished.
 
@@ -272,6 +273,7 @@ def ready_jobs(
     Args:
         busy: Stations at which an arm may be at work.
         returned_s: Fleet time of the last return, by job.
+        rank: Of more than `limit` jobs, those of a lower rank come first of all.
     """
 
     def queued_s(job: JobSpec) -> tuple[float, float, str]:
@@ -280,7 +282,7 @@ def ready_jobs(
     ready = [job for job in jobs if job.release_s <= time_s and all(map(finished, job.after))]
     ready.sort(key=queued_s)
     if len(ready) > limit:
-        ready = sorted(ready, key=lambda job: not busy.isdisjoint(job.stations))[:limit]
+        ready = sorted(ready, key=lambda job: (rank(job.name), not busy.isdisjoint(job.stations)))[:limit]
         ready.sort(key=queued_s)
     return ready
 

@@ -4,10 +4,12 @@ After every event the simulation checks its rules: no last cycle is done twice, 
 away from home on plans that exclude each other.
 """
 
+import re
 from functools import partial
 
 import pytest
 
+from benchmarks.simulation.machine import SimulatedEstimator
 from benchmarks.simulation.participants import AUCTIONEER
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
@@ -62,6 +64,18 @@ def test_jobs_are_done_once_each_in_their_order(fleet):
     assert len({fleet.status(name).arm for name in "abcde"}) > 1, "one arm did it all"
     again, other, lost = fleet.submit(first, job("b", 7), job("z", after=("nothing",)))
     assert (again.accepted, other.accepted, lost.accepted) == (True, False, False)
+
+
+def test_jobs_that_no_arm_can_do_hold_up_no_others(fleet, monkeypatch):
+    plans = SimulatedEstimator.plans
+    monkeypatch.setattr(
+        SimulatedEstimator, "plans", lambda self, job: () if job.name.startswith("heavy") else plans(self, job)
+    )
+    fleet.submit(*(job(f"heavy_{k}", 1) for k in range(100)))
+    fleet.run(20.0)
+    fleet.submit(*(job(f"light_{k}", 1) for k in range(12)))
+    fleet.until(lambda: all(fleet.finished.get(f"light_{k}") == 1 for k in range(12)), 30.0)
+    assert re.match("No arm (that has answered )?can do it: arm_0: infeasible", fleet.status("heavy_7").reason)
 
 
 @pytest.mark.parametrize("seed", range(2))

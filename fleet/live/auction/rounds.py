@@ -11,7 +11,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 from msgspec.structs import replace
@@ -29,10 +29,11 @@ from fleet.bus.protocol.auction import (
     QuoteRequest,
     Result,
 )
+from fleet.bus.protocol.consensus import Bid
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import ALL_ARMS, Operation, by_whom
 from fleet.errors import JournalFull
-from fleet.live.book import JobBook
+from fleet.live.book import MAX_UNKNOWN, JobBook
 from fleet.live.job_rules import why_not_ready
 from fleet.live.journal import SpaceTaken
 from fleet.live.leases import Timing, unanswered
@@ -236,9 +237,14 @@ def _without_conflicts(bidding: Bidding, pairs: Iterable[tuple[str, Assignment]]
     return kept
 
 
-def no_arm_can(reasons: Mapping[str, str]) -> str:
-    """Return the reason of a job that no arm can do, from the reasons of the arms."""
-    return f"No arm can do it: {'; '.join(f'{arm}: {reason}' for arm, reason in sorted(reasons.items()))}."[:MAX_REASON]
+def no_arm_can(reasons: Mapping[str, str], *, all_known: bool = True) -> str:
+    """Return the reason of a job that no arm can do, from the reasons of the arms.
+
+    Args:
+        all_known: Whether all present arms have answered.
+    """
+    each = "; ".join(f"{arm}: {reason}" for arm, reason in sorted(reasons.items()))
+    return f"No arm {'' if all_known else 'that has answered '}can do it: {each}."[:MAX_REASON]
 
 
 def reason_to_wait(bidding: Bidding, job: str) -> str:
@@ -322,6 +328,36 @@ def planned_jobs(quotes: Mapping[str, Quote]) -> set[str]:
     offers = [offer for quote in quotes.values() for offer in quote.estimates]
     open_jobs = {offer.job for offer in offers if offer.reason == NOT_PLANNED}
     return {offer.job for offer in offers if offer.feasible or offer.job not in open_jobs}
+
+
+class Refusals:
+    """Jobs that arms cannot do, by their last quotes or bids."""
+
+    def __init__(self) -> None:
+        """Start without any."""
+        self._reasons: dict[str, dict[str, str]] = {}
+        """By arm, by job; "" of an arm that can do it."""
+
+    def note(self, quote: Quote | Bid) -> None:
+        """Note which jobs an arm can do."""
+        for offer in quote.estimates:
+            by_arm = self._reasons.setdefault(offer.job, {})
+            by_arm[quote.arm] = "" if offer.feasible else offer.reason or "infeasible"
+        while len(self._reasons) > MAX_UNKNOWN:
+            del self._reasons[next(iter(self._reasons))]
+
+    def refused_by_all(self, arms: Set[str], job: str) -> bool:
+        """Return whether there are such reasons."""
+        return bool(self.of_all(job, arms))
+
+    def of_all(self, job: str, arms: Set[str]) -> Mapping[str, str]:
+        """Return the reasons, by arm, why none of these arms, and no other that has answered, can do a job.
+
+        They are empty if one can, or one of these has not answered.
+        """
+        reasons = self._reasons.get(job, {})
+        known = bool(reasons) and not (arms - reasons.keys() or NOT_PLANNED in reasons.values())
+        return reasons if known and all(reasons.values()) else {}
 
 
 class BackOff(NamedTuple):
@@ -508,7 +544,10 @@ SCAN_S = 0.05
 """Real seconds between two checks for jobs that have become ready."""
 NO_JOB = JobSpec(name="space", kind="hold", places=("?",))
 """A job that no arm can do, to ask arms for their space before there was any job."""
-NOT_OFFERED = "It waits to be offered: at most {} jobs are offered at a time, the oldest first."
+NOT_OFFERED = (
+    "It waits to be offered: at most {} jobs are offered at a time, first the ones that wait longest, last those that "
+    "no arm can do."
+)
 
 
 class Rounds:
@@ -541,6 +580,7 @@ class Rounds:
         self.present: frozenset[str] = frozenset()
         self.obstacle = ""
         self.back_offs = BackOffs(*timing.refused_s)
+        self._refusals = Refusals()
         self._name, self._book, self.allocate, self._send = name, book, allocate, send
         self._timing, self._excludes, self._boot = timing, excludes, boot
         self._count = 0
@@ -620,7 +660,9 @@ class Rounds:
         self._later_s = {job: at_s for job, at_s in self._later_s.items() if at_s > real_s}
         self._notes = {job: note for job, note in self._notes.items() if job in book.waiting}
         self._planned &= book.waiting.keys()
-        jobs = tuple(book.ready(time_s, self._timing.max_jobs, excluded=self._later_s))
+        # Many jobs that no arm can do would take the places of others in one round after the other.
+        rank = partial(self._refusals.refused_by_all, able)
+        jobs = tuple(book.ready(time_s, self._timing.max_jobs, excluded=self._later_s, rank=rank))
         busy = book.busy_stations()
         if not (bidders and any(busy.isdisjoint(job.stations) for job in jobs)):
             self._ask_for_space(real_s)
@@ -675,6 +717,8 @@ class Rounds:
             if self._may_work(arm, closing)
         }
         self._planned |= planned_jobs(quotes)
+        for quote in quotes.values():
+            self._refusals.note(quote)
         excluded = self.back_offs.why_by_job(real_s)
         usable = {arm: without_excluded(quote, excluded) for arm, quote in quotes.items()}
         taken = self._book.taken_space()

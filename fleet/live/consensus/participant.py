@@ -17,19 +17,27 @@ import math
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from random import Random
 
 from msgspec.structs import replace
 
-from fleet.bus.protocol.auction import NOT_PLANNED, SETTLED, JobSpec, JobStatus, Quote
+from fleet.bus.protocol.auction import SETTLED, JobSpec, JobStatus, Quote
 from fleet.bus.protocol.cell import Cell
 from fleet.bus.protocol.consensus import Bid, Claim
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import ALL_ARMS, Controlled, ControlRequest, Operation, by_whom
 from fleet.live.arm.node import ArmNode
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
-from fleet.live.auction.rounds import NOT_OFFERED, Bidding, Choice, no_arm_can, reason_to_wait, resolve_claims
-from fleet.live.book import MAX_UNKNOWN
+from fleet.live.auction.rounds import (
+    NOT_OFFERED,
+    Bidding,
+    Choice,
+    Refusals,
+    no_arm_can,
+    reason_to_wait,
+    resolve_claims,
+)
 from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Claimant, Granter
 from fleet.live.job_rules import SHIFT_ENDED, finish_s, job_order, joined_reasons, why_not_ready, with_terms
 from fleet.live.leases import Timing, expire
@@ -124,8 +132,7 @@ class Participant:
         self._behind_s: dict[str, float] = {}
         """Real second since which a peer knows fewer outcomes."""
         self._corrected, self._time_s = 0, 0.0
-        self._refusals: dict[str, dict[str, str]] = {}
-        """Why arms cannot do a job, by arm, by job."""
+        self._refusals = Refusals()
 
     # Messages
 
@@ -148,21 +155,13 @@ class Participant:
         if bid.arm not in self.granter.roster or (before is not None and bid.number < before[0].number):
             return
         self._bids[bid.arm] = bid, real_s
-        self._note_offers(bid)
+        self._refusals.note(bid)
         if before is None or _offered(before[0]) != _offered(bid):
             self._changed_s, self._new_bids = real_s, True
         elif (before[0].choice, before[0].choice_plan) != (bid.choice, bid.choice_plan):
             self._changed_s = real_s
         if bid.arm != self.name:
             self._send_corrections(bid, real_s)
-
-    def _note_offers(self, bid: Bid) -> None:
-        """Note which jobs the arm of a bid cannot do."""
-        for offer in bid.estimates:
-            by_arm = self._refusals.setdefault(offer.job, {})
-            by_arm[bid.arm] = "" if offer.feasible else offer.reason or "infeasible"
-        while len(self._refusals) > MAX_UNKNOWN:
-            del self._refusals[next(iter(self._refusals))]
 
     def _send_corrections(self, bid: Bid, real_s: float) -> None:
         """Send a peer outcomes of jobs that it takes for open, and jobs that it does not know."""
@@ -292,12 +291,11 @@ class Participant:
         return [replace(each, finish_s=finish_s(each, self.states.get(each.arm))) for each in statuses]
 
     def _refusal(self, job: str) -> str:
-        """Return why no present arm can do a job, or none works; "" if one can, or it is unknown."""
+        """Return why no arm can do a job, or none works; "" if one can, or this arm does not know whether it can."""
         if (pauser := self.book.operations.paused.get(ALL_ARMS)) is not None:
             return f"All arms are paused{by_whom(pauser)}."
-        reasons = self._refusals.get(job, {})
-        unknown = not reasons or self._present - reasons.keys() or NOT_PLANNED in reasons.values()
-        return "" if unknown or not all(reasons.values()) else no_arm_can(reasons)
+        reasons = self._refusals.of_all(job, {self.name})
+        return no_arm_can(reasons, all_known=self._present <= reasons.keys()) if reasons else ""
 
     def all_settled(self, real_s: float) -> bool:
         """Return whether every present arm, a majority at least, knows that every job is settled."""
@@ -315,7 +313,9 @@ class Participant:
         idle = book.ended or book.is_paused(self.name) or self._arm.unfit()
         capacity = 0 if idle else max(0, self.claimant.capacity)
         later = {job for job, until_s in self._later_s.items() if until_s > real_s}
-        ready = book.ready(time_s, self._slots, excluded=later)
+        # Last come those that it cannot do, and no other is known to be able to: whoever is bids for them.
+        rank = partial(self._refusals.refused_by_all, {self.name})
+        ready = book.ready(time_s, self._slots, excluded=later, rank=rank)
         names = [job.name for job in ready]
         cycles = {name: book.jobs[name].cycles for name in names}
         if self._choice.job not in names or self.claimant.pending:

@@ -23,6 +23,7 @@ REASONS = {
     "did not quote": "quote", "paused by": "paused", "is paused": "paused", "has a break": "break",
     "are planning": "planning", "is above its warning limit": "hot", "has impossible temperatures": "sensor",
     "is faulted": "faulted", "It waits until": "space", "No arm can do it": "no_arm",
+    "No arm that has answered": "no_arm",
     "The policy lets it wait": "policy", "Its place was in use": "place", "is in use": "place", "has a job": "busy",
     "is on its way home": "busy",
 }  # fmt: skip
