@@ -276,6 +276,7 @@ class JobBook(TimedState[BookRecord]):
             count=len(self.jobs) - len(self.settled),
             ended=self.ended,
             given_up=given_up,
+            ended_as={name: entry.state for name, entry in entries.items() if entry.is_settled},
             past=self.past,
             time_s=time_s,
         )

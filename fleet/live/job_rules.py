@@ -118,6 +118,9 @@ def reason_to_follow(before: str) -> str:
     return f"Given up, because it waits for '{before}', which is given up or cancelled."
 
 
+NO_STATES: Mapping[str, str] = {}
+
+
 def admit(
     jobs: Sequence[JobSpec],
     known: Mapping[str, JobSpec],
@@ -127,6 +130,7 @@ def admit(
     limit: int = MAX_OPEN_JOBS,
     ended: bool = False,
     given_up: Container[str] = (),
+    ended_as: Mapping[str, str] = NO_STATES,
     past: PastJobs | None = None,
     time_s: float = -inf,
 ) -> tuple[Admission, ...]:
@@ -139,6 +143,7 @@ def admit(
         count: Open jobs; by default all known ones.
         ended: Whether the shift is over.
         given_up: Known jobs that are given up: a job that waits for one is accepted, and given up too.
+        ended_as: States of known jobs that have ended.
         past: Jobs that were settled long ago; they are known, too.
         time_s: Fleet time: a job whose hard due date has passed is accepted, and given up.
     """
@@ -166,6 +171,7 @@ def admit(
     late = "Its hard due date has passed, so it is given up."
     notes = {job.name: late for job in new.values() if is_late(job, time_s)}
     notes |= lost_jobs(new.values(), given_up)
+    notes |= {job.name: _ended_note(ended_as[job.name]) for job in jobs if job.name in ended_as}
     notes |= {job.name: _past_note(job.name, past) for job in jobs if job.name in past}
     replies = [
         Admission(job.name, not why, why or notes.get(job.name, "")) for job, why in zip(jobs, reasons, strict=True)
@@ -180,6 +186,10 @@ def _in_one_message(replies: Sequence[Admission]) -> tuple[Admission, ...]:
         if sum(len(encode(reply)) + 1 for reply in replies) <= LISTED_BYTES:
             break
     return tuple(replies)
+
+
+def _ended_note(state: str) -> str:
+    return f"It is {state.replace('_', ' ')} already, and is not done again."
 
 
 def _past_note(name: str, past: PastJobs) -> str:

@@ -64,6 +64,7 @@ def test_jobs_are_done_once_each_in_their_order(fleet):
     assert len({fleet.status(name).arm for name in "abcde"}) > 1, "one arm did it all"
     again, other, lost = fleet.submit(first, job("b", 7), job("z", after=("nothing",)))
     assert (again.accepted, other.accepted, lost.accepted) == (True, False, False)
+    assert again.reason == "It is finished already, and is not done again."
 
 
 def test_jobs_that_no_arm_can_do_hold_up_no_others(fleet, monkeypatch):
