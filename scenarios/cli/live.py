@@ -217,15 +217,15 @@ def record_command(
 
     check_folder(out)
     with until_stopped() as stop, BusClient(endpoint, fleet, backlog=BACKLOG, stopped=stop.is_set) as link:
-        echo(f"ready record {endpoint}")
         connect = partial(BusClient, endpoint, fleet, timeout_s=CONNECT_S, backlog=BACKLOG)
-        recorder = record(link, out, rotate_s=rotate, stopped=stop.is_set, connect=connect)
+        on_ready = partial(echo, f"ready record {endpoint}")
+        recorder = record(link, out, rotate_s=rotate, stopped=stop.is_set, connect=connect, on_ready=on_ready)
     missed = sum(count.missed for count in recorder.counts.values())
     kept = sum(count.kept for count in recorder.counts.values())
     say(f"Recorded {kept} messages in {out}, {missed} missed.", out_console)
     if expiry := link.expiry:
         raise BusError(f"Nothing has been recorded since the certificate expired. {expiry}")
-    stop.leave("The recording is complete up to now; the same command continues it.")
+    stop.leave("All that was received is on disk; the same command continues the recording.")
 
 
 def replay_command(

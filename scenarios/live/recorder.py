@@ -432,13 +432,20 @@ class RecorderNode:
 
 
 def record(
-    link: BusClient, folder: Path, *, rotate_s: float, stopped: Callable[[], bool], connect: Callable[[], BusClient]
+    link: BusClient,
+    folder: Path,
+    *,
+    rotate_s: float,
+    stopped: Callable[[], bool],
+    connect: Callable[[], BusClient],
+    on_ready: Callable[[], object] = lambda: None,
 ) -> Recorder:
     """Record until stopped, or until the certificate expires; return the recorder, everything written.
 
     Args:
         rotate_s: Real seconds between two Parquet parts.
         connect: Makes another client of the fleet, which fetches missed messages.
+        on_ready: Called once the folder is open.
 
     Raises:
         FleetError: a disk error at the beginning or at the end; in between it is tried again.
@@ -449,6 +456,7 @@ def record(
         lock_folder(folder),
         closing(RecorderNode(link, Recorder.open(folder, link.fleet), connect, rotate_s=rotate_s)) as node,
     ):
+        on_ready()
         while not (stopped() or link.expiry):
             node.serve()
         node.end()

@@ -46,6 +46,10 @@ TELEMETRY = "telemetry of "
 RESTARTED, ABSENT = "the arm was restarted", "no later state of the arm is recorded"
 UNKNOWN_RETURN = "the reason is not recorded"
 """Why an arm has a job no more."""
+NO_STATES = (
+    "No auctioneer published the states of jobs: those that no arm began are missing here, and so are outcomes and due "
+    "dates that no arm reported."
+)
 _ENDED = ("waiting", "given_up", "unfinished", "cancelled")
 """States of a job in which the arm that had it has it no more."""
 
@@ -121,7 +125,8 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
         halts=(*_silences(alarms, results["time_s"].to_pylist(), arms), *pauses),
         ended_s=min((row["time_s"] for row in results.to_pylist() if row["shift_ended"]), default=math.inf),
         offers=tuple(offer for row in results.to_pylist() for offer in offers_of(row)),
-        remarks=tuple(_left_out(epochs, card.senders)),
+        remarks=(*_left_out(epochs, card.senders), *([] if results.num_rows else [NO_STATES])),
+        unknown="" if results.num_rows else "unknown: jobs that no arm finished",
         model=model,
     )
 

@@ -323,6 +323,8 @@ class ShiftLog:
     """End of the shift, if it was before the last reading."""
     remarks: tuple[str, ...] = ()
     """What its records leave out, in sentences."""
+    unknown: str = ""
+    """What its jobs may lack, for the badge; "" if they are complete."""
 
     @cached_property
     def begin(self) -> datetime | None:

@@ -82,8 +82,10 @@ def verdict(log: ShiftLog) -> Verdict:
     else:
         counts = ((len(faults), "fault"), (contacts, "contact"), (len(late), "late job"))
         badge = ", ".join(f"{count} {what}{'s' * (count > 1)}" for count, what in counts if count)
-        badge = badge or ("No fault, no late job" if status == "finished" else f"Status: {status}")
-    good = status == "finished" and not faults and not contacts and not late
+        calm = "No fault, no job" if metrics.get("jobs") == 0 else "No fault, no late job"
+        badge = badge or (calm if status == "finished" else f"Status: {status}")
+    badge = f"{badge}; {log.unknown}" if log.unknown else badge
+    good = status == "finished" and not (faults or contacts or late or log.unknown)
     return Verdict(badge=badge, good=good, sentences=tuple(sentences), moments=moments)
 
 

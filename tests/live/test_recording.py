@@ -42,7 +42,7 @@ from fleet.robot import ThermalLimits
 from scenarios.cli.main import main
 from scenarios.live.recorder import SWEEP_S, GapFetcher, Recorder, record
 from scenarios.live.recording import CARD, SOURCES, alarms_of, open_messages, read_card, read_parts, replay
-from scenarios.live.recording_report import epochs_of, heat_use, open_recording, order_events
+from scenarios.live.recording_report import NO_STATES, epochs_of, heat_use, open_recording, order_events
 from scenarios.result_folder import lock_folder
 from scenarios.run.records import JobRecord, ShiftLog, schedule
 from scenarios.show.run_page import late_jobs, lateness_text, report_html, verdict
@@ -638,6 +638,7 @@ def test_most_arms_tell_the_last_epoch_without_an_auctioneer(tmp_path):
     assert log.arms == ("arm_1", "arm_2")
     assert log.remarks == (
         "2 epochs are recorded; this page shows the last one, one, without alarms and requests that name no epoch.",
+        NO_STATES,
     )
 
 
@@ -684,6 +685,16 @@ def test_without_an_auctioneer_a_job_is_returned_when_and_why_the_records_tell(
     assert (back.job, back.time_s, back.reason) == ("x", end_s, reason)
     spans = [(span.job, span.start_s, span.end_s, span.outcome) for span in log.plan.assignments]
     assert spans == [("x", 1.0, end_s, "returned"), ("y", 40.0, 62.0, "finished")][: len(later)]
+
+
+def test_without_an_auctioneer_a_report_does_not_promise_that_all_went_well(tmp_path):
+    """Jobs that no arm began are not recorded; without any job there is none that was in time."""
+    log = record_peers(tmp_path, [[""] * 100], NEXT_JOB)
+    first = verdict(log)
+    assert (first.badge, first.good) == ("No fault, no late job; unknown: jobs that no arm finished", False)
+    assert NO_STATES in first.sentences
+    card = {"status": "finished", "metrics": {"jobs": 0}}
+    assert verdict(dataclasses.replace(log, card=card, unknown="")).badge == "No fault, no job"
 
 
 def test_an_end_that_no_state_shows_is_at_the_next_award_and_its_reason_unknown(tmp_path):
