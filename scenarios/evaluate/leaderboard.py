@@ -100,6 +100,17 @@ class BoardResult(msgspec.Struct, frozen=True, kw_only=True):
         """Shifts in which the policy failed."""
         return sum(row.figures is None for row in self.rows)
 
+    @property
+    def faults(self) -> float | None:
+        """Mean over the shifts in which the policy did not fail; None if there is none."""
+        values = [row.figures[FIGURES.index("faults")] for row in self.rows if row.figures]
+        return sum(values) / len(values) if values else None
+
+    @property
+    def faults_text(self) -> str:
+        """`faults` as a cell of a table."""
+        return "" if self.faults is None else f"{self.faults:.2f}"
+
     def study_rows(self) -> list[Row]:
         """As a study has them."""
         return [
@@ -309,6 +320,11 @@ def submissions_of(card: Mapping[str, Any], rows: Sequence[Row], author: str, ab
     return made
 
 
+def failed_text(count: int) -> str:
+    """That a policy failed in shifts, as the end of a sentence; "" for none."""
+    return f", {count} failed shift{'s' * (count > 1)}, which count as random" if count else ""
+
+
 BASELINE, SOURCE = "wsept", "twin"
 """Policy that differences refer to, with the predictions of this source if it has several; without it the last of the
 board."""
@@ -330,13 +346,20 @@ class Board:
         """Names of the submissions, the best first."""
         return ranked(self.scores)
 
+    def as_json(self) -> dict[str, Any]:
+        """The scores, with mean faults and failed shifts of each submission (Any: JSON values)."""
+        described = asdict(self.scores)
+        for name, entry in self.entries.items():
+            described["policies"][name] |= {"faults": entry.faults, "failed": entry.failures}
+        return described
+
     @property
     def summary(self) -> str:
         """The policy with the highest mean score of each scope, in a sentence."""
         best: dict[str, str] = {}
         for name in self.order:
-            card = self.entries[name].card
-            best.setdefault(card.scope, f"`{card.policy}` ({self.scores.policies[name].mean.text()})")
+            card, failed = self.entries[name].card, failed_text(self.entries[name].failures)
+            best.setdefault(card.scope, f"`{card.policy}` ({self.scores.policies[name].mean.text()}{failed})")
         texts = [f"{scope} {best[scope]}" for scope in ("central", "arm") if scope in best]
         return f"Highest mean score of scope {', of scope '.join(texts)}."
 

@@ -44,9 +44,9 @@ def score_table(scores: SuiteScores, labels: Mapping[str, str] | None = None) ->
     return Table(head=HEADS, rows=tuple(rows))
 
 
-def narrow_score_tables(scores: SuiteScores, labels: Mapping[str, str] | None = None) -> tuple[Table, Table]:
+def narrow_score_tables(scores: SuiteScores) -> tuple[Table, Table]:
     """The table of scores in two parts, each narrow enough for 80 columns."""
-    table = score_table(scores, labels)
+    table = score_table(scores)
     return table.select(0, 1, 2, 3, 7), table.select(0, 4, 5, 6)
 
 

@@ -87,6 +87,13 @@ def test_a_study_of_a_whole_split_becomes_a_file_for_each_policy_and_a_table(stu
     (first,) = re.findall(r"\| 1 \|.*", text)
     assert [cell.strip() for cell in first.split("|")][2:4] == ["`wsept`", scope_of("wsept")]
     assert "200 of 200 instances; differences to `wsept` (oracle)." in text
+    for shown in (thermofleet("leaderboard", sent).out, text):
+        assert "`wsept` (0.75 [" in shown
+        assert "50 failed shifts, which count as random)" in " ".join(shown.split())
+    *_, row = [line for line in thermofleet("leaderboard", sent).out.splitlines() if line.startswith("wsept")]
+    assert row.split()[-2:] == ["0.00", "50"]
+    in_json = json.loads(thermofleet("leaderboard", sent, "--json").out)["policies"]["test-wsept-oracle"]
+    assert (in_json["faults"], in_json["failed"]) == (0.0, 50)
     assert board_text(sent, "validation") == "No results on the split validation."
     assert thermofleet("leaderboard", tmp_path / "absent").code == 2
 
