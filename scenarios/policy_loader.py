@@ -331,6 +331,8 @@ def _module(where: str, name: str) -> ModuleType:
         except ImportError as error:
             known = f"Rules: {', '.join(RULES)}. Wrappers: {', '.join(WRAPPERS)}."
             raise FleetError(f"Policy '{name}': cannot import '{where}' ({error}). {known}") from error
+        except (Exception, SystemExit) as error:  # of the module
+            raise _not_loaded(name, where, error, None) from error
     path = Path(where)
     spec = importlib.util.spec_from_file_location(f"own_policy_{path.stem}", path)
     if spec is None or spec.loader is None or not path.is_file():
@@ -338,11 +340,13 @@ def _module(where: str, name: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:  # of the file
-        syntax = isinstance(error, SyntaxError)
-        line = error.lineno if syntax else last_line(error, path)
-        raise FleetError(
-            f"Policy '{name}': '{where}' cannot be loaded: {type(error).__name__}{f' in line {line}' if line else ''}: "
-            f"{error.msg if syntax else error}."
-        ) from error
+    except (Exception, SystemExit) as error:  # of the file
+        raise _not_loaded(name, where, error, last_line(error, path)) from error
     return module
+
+
+def _not_loaded(name: str, where: str, error: BaseException, line: int | None) -> FleetError:
+    syntax = isinstance(error, SyntaxError)
+    line, text = (error.lineno, error.msg) if syntax else (line, error_text(error).partition(": ")[2])
+    kind = f"{type(error).__name__}{f' in line {line}' if line else ''}"
+    return FleetError(f"Policy '{name}': '{where}' cannot be loaded: {kind}{f': {text}' if text else ''}.")
