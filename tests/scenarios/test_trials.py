@@ -171,6 +171,27 @@ def test_failed_shifts_are_run_again_and_no_others(scenario, plans, tmp_path):
     assert not any(row.error for row in read_rows(tmp_path / "out"))
 
 
+def test_an_interruption_of_a_policy_is_its_failure_and_ctrl_c_is_none(thermofleet, small_toml, tmp_path):
+    policy = tmp_path / "stops.py"
+    policy.write_text(
+        "import os, signal, threading\n"
+        "class Raises:\n    scope = 'central'\n    def reset(self, rng): pass\n"
+        "    def act(self, seen): raise KeyboardInterrupt\n"
+        "class Pressed(Raises):\n    def act(self, seen):\n"
+        "        for process in (os.getpid(), os.getppid()): os.kill(process, signal.SIGINT)\n"
+        "        threading.Event().wait()\n",
+        encoding="utf-8",
+    )
+    how = (small_toml, "--difficulty", "blind", "--seeds", 2, "--workers", 1, "--policies")
+    told = thermofleet("compare", *how, f"{policy}:Raises").succeeded().out
+    assert (
+        "Raises failed in 2 shifts, first in heat, fleet 0, training 0, seed 0: KeyboardInterrupt (at 0 s"
+        in " ".join(told.split())
+    )
+    pressed = thermofleet("compare", *how, f"{policy}:Pressed")
+    assert (pressed.code, pressed.err.partition(":")[0]) == (130, "Interrupted while comparing")
+
+
 @pytest.mark.parametrize("is_package", [False, True])
 def test_a_policy_is_another_one_when_what_it_imports_has_changed(tmp_path, monkeypatch, is_package):
     monkeypatch.chdir(tmp_path)
