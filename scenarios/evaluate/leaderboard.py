@@ -5,15 +5,19 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
+import numpy as np
 
 from fleet.bus.exchange.channel import PERFECT
-from fleet.engine.observe import PEAK_HIGH_C, PEAK_LOW_C
+from fleet.engine.batch import RewardWeights
+from fleet.engine.observe import PEAK_HIGH_C
 from fleet.errors import FleetError, printable
 from fleet.files import atomic_path
+from fleet.seeding import shift_seeds
 from scenarios.evaluate.references import ShiftReference
 from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
 from scenarios.evaluate.scores import Shift, SuiteScores, normalised, ranked, references_of, scores_of
@@ -22,10 +26,11 @@ from scenarios.evaluate.study import CARD, Row, RowKey, suite_of
 from scenarios.policy_loader import is_built_in, is_on_bus, label, scope_of
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.result_folder import disk_errors
+from scenarios.spec.jobs import draw_jobs, weights_of
 from scenarios.spec.options import DECISION_LIMIT_S, RiskName
 from scenarios.spec.schema import SplitName
 from scenarios.suite.instances import JUDGED
-from scenarios.suite.splits import ManifestLine, cell_of_instance, line_of, manifest
+from scenarios.suite.splits import ManifestLine, cell_of_instance, instance_of, line_of, manifest
 
 DIGITS = 10
 """Significant digits of figures in a file."""
@@ -223,14 +228,41 @@ def _problems_of_shift(row: ResultLine, line: ManifestLine, known: ShiftReferenc
         yield f"has counts that are no whole numbers ({', '.join(counts)})"
     if max(own["above_warning_min"], own["hot_surface_min"]) > longest_min + SLACK:
         yield f"has more minutes above a limit than its arms work ({longest_min:g})"
-    if not PEAK_LOW_C <= own["peak_c"] <= PEAK_HIGH_C:
-        yield f"has a hottest motor of {own['peak_c']:g} °C, not within {PEAK_LOW_C:g} to {PEAK_HIGH_C:g}"
-    if reward > own["value"] + SLACK * (1 + own["value"]):
-        yield f"has a reward of {reward:.4g}, above the finished value {own['value']:.4g}: all else is a cost"
+    limits = _limits_of(line)
+    if not limits.ambient_c - SLACK <= own["peak_c"] <= PEAK_HIGH_C:
+        yield f"has a hottest motor of {own['peak_c']:g} °C, not within {limits.ambient_c:g} to {PEAK_HIGH_C:g}"
+    if own["value"] > limits.value + SLACK * limits.value:
+        yield f"has a finished value of {own['value']:.4g}, but its jobs have {limits.value:.4g}"
+    weights = limits.weights
+    costs = -weights.faults * own["faults"] - weights.above_warning * own["above_warning_min"]
+    if reward > own["value"] - costs + SLACK * (1 + own["value"] + costs):
+        yield (
+            f"has a reward of {reward:.4g}, above the finished value {own['value']:.4g} less {costs:.4g} for faults "
+            "and minutes above the warning limit: all else is a cost"
+        )
     if known and reward < (least := known.random - MOST_LOSS * max(known.unit, known.upper - known.random)):
         yield f"has a reward of {reward:.4g}, below what the worst policy could lose ({least:.4g})"
     if known and reward > known.upper + SLACK * (1 + abs(known.upper)):
         yield f"has a reward of {reward:.4g}, above the upper bound {known.upper:.4g}, which no policy exceeds"
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """What the jobs, the reward and the ambient temperature of an instance allow."""
+
+    value: float
+    """Of all its jobs."""
+    weights: RewardWeights
+    ambient_c: float
+    """Lowest ambient temperature."""
+
+
+@cache
+def _limits_of(line: ManifestLine) -> _Limits:
+    made = instance_of(line)
+    jobs = draw_jobs(made.scenario, shift_seeds(np.random.SeedSequence(made.seed))[0])
+    coolest_c = min(ambient_c for _, ambient_c in made.scenario.ambient.points)
+    return _Limits(sum(job.value for job in jobs), weights_of(made.scenario), coolest_c)
 
 
 def write(submission: BoardResult, folder: Path) -> Path:

@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import msgspec
@@ -30,7 +30,7 @@ from scenarios.evaluate.study import Row, Study, suite_of
 from scenarios.policy_loader import policy_of, scope_of
 from scenarios.suite.splits import manifest
 
-BLANK = Outcome(**dict.fromkeys(FIGURES, 0.0) | {"value": 50.0})
+BLANK = Outcome(**dict.fromkeys(FIGURES, 0.0) | {"value": 50.0, "peak_c": 60.0})
 
 
 def reference(line) -> ShiftReference:
@@ -142,11 +142,14 @@ FORGED = {
     "another process": (changed(None, policy="bus:mine", policy_hash=""), None),
     "files of another process": (changed(None, policy="bus:mine"), r"\(bus:NAME has none\)"),
     "more than the value": (changed(7, value=11.9), r"test/0007 has a reward of 12, above the finished value 11\.9"),
+    "more value than its jobs have": (changed(7, value=1e6), r"has a finished value of 1e\+06, but its jobs have \d"),
+    "faults without their price": (changed(7, faults=1e6), "above the finished value 50 less .* for faults"),
+    "minutes without their price": (changed(7, above_warning_min=1e3), "above the finished value 50 less 50 for"),
     "no number": (changed(7, value=float("nan")), "needs 11 figures of at most 1e\\+09"),
     "below 0": (changed(7, faults=-1.0), "a figure below 0"),
     "half a fault": (changed(7, faults=0.5), "counts that are no whole numbers"),
     "more minutes than the shift": (changed(7, above_warning_min=1e6), "more minutes above a limit"),
-    "a motor below absolute zero": (changed(7, peak_c=-500.0), "a hottest motor of -500 °C"),
+    "a motor cooler than the air": (changed(7, peak_c=1.0), "a hottest motor of 1 °C, not within"),
     "an endless loss": (changed(7, reward=-1e9), "a reward of -1e\\+09, below what the worst policy could lose"),
     "neither figures nor error": (changed(7, figures=None), "needs either figures or an error"),
 }
@@ -162,7 +165,7 @@ def good(study: Study) -> BoardResult:
         manifest=leaderboard.manifest_hash("test"), code_hash="a" * 16, policy_hash="c" * 16, risk="rc",
         versions=versions,
     )  # fmt: skip
-    figures = [12.0 if name == "reward" else 50.0 if name == "value" else 0.0 for name in FIGURES]
+    figures = [*astuple(replace(BLANK, reward=12.0))]
     rows = [
         ResultLine(instance=case.name, scenario=scenarios[case.name], seed=case.seeds[0], training=0, figures=figures,
                illegal=0)
