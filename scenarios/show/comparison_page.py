@@ -279,7 +279,7 @@ def _reward_verdict(results: Sequence[Comparison]) -> Iterator[str]:
             difference = result.lead if other == others[0] else result.figures[best]["reward"].to_base
             assert difference is not None
             significant = difference.excludes_zero and _significant(difference.p, len(others))
-            doubt = "" if significant else " (not significant)"
+            doubt = "" if significant else " (not significant)" if result.draws > 1 else " (one seed: not tested)"
             more.append(f"{difference.text(1)} more than {role} {label(other)}{doubt}")
         rewards = {name: (each["reward"].to_base, each["reward"].p_holm) for name, each in result.figures.items()}
         sentences = [f"{'; '.join([f'{label(best)} has the most reward, {reward}', *more])}.", *_below(rewards, base)]

@@ -284,6 +284,13 @@ def test_the_best_of_several_must_be_significant_among_them(study: Study):
         assert said in first
 
 
+def test_a_difference_of_one_seed_is_called_untested(study: Study):
+    single = replace(study, cases=[replace(study.cases[0], seeds=(0,))])
+    first, _ = verdict(judged(single, rows_of(single), {}, "fifo"))
+    assert first.count("(one seed: not tested)") == 2
+    assert "significant" not in first
+
+
 @pytest.mark.parametrize(
     ("baseline", "others"),
     [
