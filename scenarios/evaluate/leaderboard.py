@@ -291,21 +291,30 @@ def read(path: Path) -> BoardResult:
     Raises:
         FleetError: it is too large, or a line is no part of a result.
     """
-    number = 1
+    number, line = 1, ""
     try:
         if path.stat().st_size > MOST_BYTES:
             raise FleetError(f"'{path}': a result has at most {MOST_BYTES} bytes.")
-        first, *rest = path.read_text(encoding="utf-8").rstrip("\n").split("\n")
-        card, rows = msgspec.json.decode(first, type=Card), list[ResultLine]()
+        line, *rest = path.read_text(encoding="utf-8").rstrip("\n").split("\n")
+        card, rows = msgspec.json.decode(line, type=Card), list[ResultLine]()
         for line in rest:
             number += 1
             rows.append(msgspec.json.decode(line, type=ResultLine))
     except OSError as error:
         raise FleetError(f"Cannot read '{path}': {error.strerror}.") from error
     except (ValueError, msgspec.DecodeError) as error:
-        why = f"line {number}: {printable(str(error))}"
+        why = f"line {number}: {printable(_problem_text(error, line))}"
         raise FleetError(f"'{path}' is no result of `thermofleet leaderboard --submit`: {why}.") from error
     return BoardResult(card=card, rows=tuple(rows))
+
+
+def _problem_text(error: Exception, line: str = "") -> str:
+    """What is wrong with a line, without regular expressions."""
+    named = re.search(r"NaN|-?Infinity", line)
+    if named and not isinstance(error, msgspec.ValidationError):
+        return f"{error}: {named[0]} is no number of JSON"
+    text = str(error).replace(f"matching regex {PLAIN!r}", "without control characters and | < > `")
+    return re.sub(r"matching regex '.*'", "of 16 hexadecimal digits", text)
 
 
 def submissions_of(card: Mapping[str, Any], rows: Sequence[Row], author: str, about: str) -> list[BoardResult]:
@@ -346,7 +355,7 @@ def submissions_of(card: Mapping[str, Any], rows: Sequence[Row], author: str, ab
             try:
                 head = msgspec.convert(header, Card)
             except msgspec.ValidationError as error:
-                raise FleetError(f"The result of '{policy}' cannot be written: {error}.") from error
+                raise FleetError(f"The result of '{policy}' cannot be written: {_problem_text(error)}.") from error
             lines = tuple(result_line(row, card["instances"][row.key.instance]) for row in own)
             made.append(BoardResult(card=head, rows=lines))
     return made

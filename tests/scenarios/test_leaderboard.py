@@ -210,6 +210,17 @@ def test_a_file_is_read_as_it_was_written_and_nothing_else_is(good: BoardResult,
         path.write_text("\n".join([bad, *lines[1:]]), encoding="utf-8")
         with pytest.raises(FleetError, match="is no result of `thermofleet leaderboard --submit`"):
             read(path)
+    for bad, said in (
+        (
+            json.dumps(json.loads(lines[0]) | {"author": "a | b"}),
+            "without control characters and | < > ` - at `$.author`",
+        ),
+        (json.dumps(json.loads(lines[0]) | {"code_hash": "?"}), "of 16 hexadecimal digits - at `$.code_hash`"),
+        (lines[0].replace("[0", "[NaN").replace('"trainings":1', '"trainings":NaN'), ": NaN is no number of JSON"),
+    ):
+        path.write_text("\n".join([bad, *lines[1:]]), encoding="utf-8")
+        with pytest.raises(FleetError, match=re.escape(said)):
+            read(path)
     path.write_text("\n".join([*lines[:2], lines[2][:20], *lines[3:]]), encoding="utf-8")
     with pytest.raises(FleetError, match="line 3: "):
         read(path)

@@ -15,7 +15,7 @@ from scenarios.evaluate import runner, sources
 from scenarios.evaluate.comparison import comparison_of, comparisons
 from scenarios.evaluate.rollout import FIGURES, outcomes
 from scenarios.evaluate.store import RESULTS, UNFINISHED, opened, read_rows
-from scenarios.evaluate.study import Case, RowKey, Study, Unit, policy_hash, seeds_of_instance
+from scenarios.evaluate.study import CARD, Case, RowKey, Study, Unit, policy_hash, seeds_of_instance
 from scenarios.policy_loader import label
 from scenarios.prepare import fleet as preparing
 from scenarios.prepare.arms import plan_arms
@@ -112,6 +112,21 @@ def test_a_folder_of_something_else_is_refused(scenario, plans, tmp_path, bad):
         runner.run_study(study, out=tmp_path / "busy", cache_dir=plans, workers=1)
     with pytest.raises(FleetError, match="holds other files"):
         runner.run_study(study, out=tmp_path, cache_dir=plans, workers=1)
+
+
+def test_a_damaged_or_missing_card_is_named(scenario, tmp_path):
+    study, out = study_of(scenario), tmp_path / "out"
+    with opened(out, study.card):
+        pass
+    (out / CARD).write_text("{", encoding="utf-8")
+    with (
+        pytest.raises(FleetError, match=r"has a damaged study\.json; --out needs a new folder"),
+        opened(out, study.card),
+    ):
+        pass
+    (out / CARD).unlink()
+    with pytest.raises(FleetError, match=r"has results\.parquet, but no study\.json"), opened(out, study.card):
+        pass
 
 
 @pytest.mark.ci_slow
