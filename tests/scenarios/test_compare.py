@@ -65,7 +65,7 @@ def test_what_takes_no_time_needs_no_worker(scenario, plans, monkeypatch):
     monkeypatch.setattr("scenarios.evaluate.runner.LocalWorker", None)
     told: list[tuple[str, float]] = []
     compared(scenario, plans, workers=2, progress=lambda stage, share: told.append((stage, share)))
-    assert [share for stage, share in told if stage == "comparing"] == [0.5, 1.0]
+    assert [share for stage, share in told if stage == "comparing"] == [0.0, 0.5, 1.0]
 
 
 @pytest.mark.parametrize(
