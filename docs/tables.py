@@ -227,7 +227,7 @@ def board_text(folder: Path, split: str) -> str:
         card, stars, place = entry.card, stars.replace("*", "\\*"), str(len(groups[plans(entry)]) + 1)
         known = exact.get(card.policy, "")
         cells = (place, title(entry), card.scope, mean, f"{difference_} {stars}".strip(), *rest[:2], known, *rest[2:])
-        more = (f"{mean_of(entry, 'faults'):.2f}", str(entry.failures or ""), card.author, f"`{card.code_hash[:8]}`")
+        more = (entry.faults_text, str(entry.failures or ""), card.author, f"`{card.code_hash[:8]}`")
         groups[plans(entry)].append((*cells, *more))
     parts = [board.summary, table(BOARD, groups[False])]
     if groups[True]:
@@ -249,7 +249,7 @@ def board_top(folder: Path) -> str:
         entry, score = board.entries[name], board.scores.policies[name]
         if place <= SHOWN or entry.card.policy in ("wspt", "random"):
             hot, cool = (f"{each.mean:.2f}" if each else "" for each in (score.hot, score.cool))
-            cells = (title(entry), entry.card.scope, score.mean.text(), hot, cool, f"{mean_of(entry, 'faults'):.2f}")
+            cells = (title(entry), entry.card.scope, score.mean.text(), hot, cool, entry.faults_text)
             rows.append((str(place), *cells, exact.get(entry.card.policy, "")))
     heads = ("", "policy", "scope", "mean score", "heat binds", "it does not", "faults", "true state")
     return f"{table(heads, rows)}\n\nMean score of the hindsight: {board.scores.reachable}."
@@ -313,7 +313,7 @@ def planners(folder: Path) -> str:
         (
             name,
             *(values.only(part).interval(values.only(part).score[name]).text() for part in parts),
-            f"{mean_of(found[name], 'faults'):.2f}",
+            found[name].faults_text,
         )
         for name in found
     ]
@@ -336,7 +336,7 @@ def knowledge(folder: Path) -> str:
         own = (values, values.only(hot), values.only(surprised))
         means = [each.interval(each.score[name]).text() for each in own]
         some = [share_of_gain(each, name) for each in own[1:]]
-        rows.append((KNOWLEDGE[name], f"`{name}`", *means, *some, f"{mean_of(found[name], 'faults'):.2f}"))
+        rows.append((KNOWLEDGE[name], f"`{name}`", *means, *some, found[name].faults_text))
     heads = ("the arms know", "source", "mean score", "heat binds", "heat binds, surprise", "share of the gain")
     count = (
         f"{len(values.instances)} instances in {len(set(values.cells))} cells; heat binds in {int(hot.sum())}, "
@@ -456,13 +456,6 @@ def title(entry: BoardResult) -> str:
     return f"`{entry.card.policy}`{more}"
 
 
-def mean_of(entry: BoardResult, figure: str) -> float:
-    """Mean of a figure over the shifts of a result that did not fail."""
-    index = FIGURES.index(figure)
-    values = [row.figures[index] for row in entry.rows if row.figures]
-    return sum(values) / max(1, len(values))
-
-
 def faults_in(entry: BoardResult, instances: Sequence[str]) -> Array:
     """Faults in instances of a result of one training without failures, [instance]."""
     index = FIGURES.index("faults")
@@ -553,7 +546,7 @@ def by_size(folder: Path, split: str, groups: Mapping[str, Callable[[Array], Arr
         cells = [title(found[name])]
         for scores in parts.values():
             cells.append("" if name == CENTRAL else shown(scores.policies[name].difference))
-        rows.append((*cells, f"{mean_of(found[name], 'faults'):.2f}"))
+        rows.append((*cells, found[name].faults_text))
     return table(("policy", *parts, "faults"), rows)
 
 

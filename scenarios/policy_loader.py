@@ -5,6 +5,7 @@ process as `bus:NAME` or `bus:NAME@ENDPOINT`, the folder of a trained one, or an
 import importlib
 import importlib.util
 import os
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -71,14 +72,19 @@ def failure(name: str, error: BaseException, where: str) -> BaseException:
     return PolicyFailed(f"The policy '{name}' failed in {where}: {error_text(error).rstrip('.: ')}{place}.")
 
 
+def is_ctrl_c(error: BaseException) -> bool:
+    """Whether an error may be Ctrl-C; a worker ignores that, so a `KeyboardInterrupt` in it is raised by code."""
+    return isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) != signal.SIG_IGN
+
+
 @contextmanager
 def blaming(name: str, where: str) -> Iterator[None]:
     """Raise the `failure` of a policy for every exception of its code in the block, SystemExit too."""
     try:
         yield
-    except KeyboardInterrupt:
-        raise
     except BaseException as error:
+        if is_ctrl_c(error):
+            raise
         raise failure(name, error, where) from error
 
 
@@ -96,7 +102,7 @@ def error_text(error: BaseException) -> str:
         text = str(error).encode("utf-8", "backslashreplace").decode()
     except Exception as failed:  # of its code
         text = f"(its text raises {type(failed).__name__})"
-    return f"{type(error).__name__}: {text}"
+    return f"{type(error).__name__}{f': {text}' if text else ''}"
 
 
 def policy_of(name: str, bus: OnBus = ON_BUS) -> Policy:
@@ -331,6 +337,8 @@ def _module(where: str, name: str) -> ModuleType:
         except ImportError as error:
             known = f"Rules: {', '.join(RULES)}. Wrappers: {', '.join(WRAPPERS)}."
             raise FleetError(f"Policy '{name}': cannot import '{where}' ({error}). {known}") from error
+        except (Exception, SystemExit) as error:  # of the module
+            raise _not_loaded(name, where, error, None) from error
     path = Path(where)
     spec = importlib.util.spec_from_file_location(f"own_policy_{path.stem}", path)
     if spec is None or spec.loader is None or not path.is_file():
@@ -338,11 +346,13 @@ def _module(where: str, name: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:  # of the file
-        syntax = isinstance(error, SyntaxError)
-        line = error.lineno if syntax else last_line(error, path)
-        raise FleetError(
-            f"Policy '{name}': '{where}' cannot be loaded: {type(error).__name__}{f' in line {line}' if line else ''}: "
-            f"{error.msg if syntax else error}."
-        ) from error
+    except (Exception, SystemExit) as error:  # of the file
+        raise _not_loaded(name, where, error, last_line(error, path)) from error
     return module
+
+
+def _not_loaded(name: str, where: str, error: BaseException, line: int | None) -> FleetError:
+    syntax = isinstance(error, SyntaxError)
+    line, text = (error.lineno, error.msg) if syntax else (line, error_text(error).partition(": ")[2])
+    kind = f"{type(error).__name__}{f' in line {line}' if line else ''}"
+    return FleetError(f"Policy '{name}': '{where}' cannot be loaded: {kind}{f': {text}' if text else ''}.")

@@ -4,6 +4,7 @@ The processes end soon after the one that started them, also if that is killed.
 """
 
 import os
+import signal
 import threading
 import warnings
 from collections import deque
@@ -255,6 +256,7 @@ def _begin(parent: int) -> None:
     """Mark this process as a worker that ends with its parent."""
     global _is_worker
     _is_worker = True
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C also reaches the parent, which ends its workers
     end_with(parent)
 
 

@@ -509,6 +509,13 @@ def test_late_jobs_turn_the_badge_red_and_abandoned_ones_come_last() -> None:
     )
 
 
+def test_a_job_that_was_due_before_its_release_and_never_taken_has_no_time_of_work() -> None:
+    events = (event(300.0, "release", job="open-1"), event(1000.0, "warning", job=""))
+    jobs = (replace(record("open-1", 60.0, "waiting"), release_s=300.0),)
+    log = replace(log_of(telemetry(1000), ("arm_a", "arm_b"), events), jobs=jobs)
+    assert lateness_text(log, late_jobs(log)).endswith(": it was due 4 min before its release.")
+
+
 @pytest.mark.parametrize(
     ("kind", "told"), [("break", "had a break at 0:03:20"), ("failure", "failed, not by heat, at 0:03:20")]
 )

@@ -102,9 +102,12 @@ def agent_of(agents: Sequence[str], agent: object) -> str:
 
 
 def _integer(agent: str, action: object) -> int:
-    """One integer; one beyond 64 bits becomes an action that no action space has, so the agent waits."""
+    """One integer, also in an array of one element, which some trainers return; no list.
+
+    One beyond 64 bits becomes an action that no action space has, so the agent waits.
+    """
     if type(action) is not int:
-        value = np.asarray(action)
+        value = np.asarray(action if hasattr(action, "__array__") else ())
         if value.size == 1 and np.issubdtype(value.dtype, np.integer):
             action = int(value.reshape(()))
         elif not isinstance(action, int) or isinstance(action, bool):

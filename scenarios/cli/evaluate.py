@@ -1,6 +1,6 @@
 """Commands that evaluate and train policies: compare, bounds, leaderboard and train."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from math import inf
 from os import cpu_count
 from pathlib import Path
@@ -366,7 +366,7 @@ def leaderboard_command(
         raise FleetError("--author, --about and --policies are for --submit: leave them out.")
     from scenarios.evaluate.leaderboard import board_of, read_all
     from scenarios.evaluate.statistics import LEGEND
-    from scenarios.show.comparison_page import narrow_score_tables
+    from scenarios.show.comparison_page import score_table
     from scenarios.spec.parse import choose
 
     split = choose("split", split, BoardSplit)
@@ -374,7 +374,7 @@ def leaderboard_command(
         raise FleetError(f"'{folder}' is no folder. Give the folder of the results.")
     board = board_of(split, read_all(folder, split))
     if as_json:
-        print_json(board.scores if board else None)
+        print_json(board and board.as_json())
     elif board is None:
         echo(f"No results on the split {split}.")
     else:
@@ -386,7 +386,14 @@ def leaderboard_command(
             for name, each in board.entries.items()
         }
         about = f"Predictions: {', '.join(sources)}. (arm): scope arm, others central. {LEGEND}."
-        out_console.print(board.summary, about, *narrow_score_tables(board.scores, labels), board.remark, sep="\n")
+        scores = score_table(board.scores, labels)
+        better, entries = scores.select(0, 7), [board.entries[name] for name in board.order]
+        rows = tuple(
+            (*row, each.faults_text, str(each.failures or "")) for row, each in zip(better.rows, entries, strict=True)
+        )
+        more = replace(better, head=(*better.head, "faults", "failed"), rows=rows)
+        tables = scores.select(0, 1, 2, 3), scores.select(0, 4, 5, 6), more  # each narrow enough for 80 columns
+        out_console.print(board.summary, about, *tables, board.remark, sep="\n")
 
 
 def submit_results(results: Path, author: str, about: str, policies: str | None, out: Path) -> None:
@@ -398,7 +405,7 @@ def submit_results(results: Path, author: str, about: str, policies: str | None,
     from scenarios.extras import require_extra
 
     require_extra("report")
-    from scenarios.evaluate.leaderboard import check, split_references, submissions_of, write
+    from scenarios.evaluate.leaderboard import check, failed_text, split_references, submissions_of, write
     from scenarios.evaluate.store import read_card, read_rows
     from scenarios.policy_loader import label
 
@@ -418,5 +425,4 @@ def submit_results(results: Path, author: str, about: str, policies: str | None,
         check(each, known[each.card.split])
     for each in made:
         path = write(each, out)
-        failed = f", {each.failures} failed shifts, which count as random" if each.failures else ""
-        say(f"Checked: {len(each.rows)} shifts of {each.card.policy}{failed}. Written to {path}.")
+        say(f"Checked: {len(each.rows)} shifts of {each.card.policy}{failed_text(each.failures)}. Written to {path}.")

@@ -55,7 +55,7 @@ def run_command(
     as_json: bool = options.JSON,
 ) -> None:
     """Run one shift of a scenario and record it."""
-    from scenarios.policy_loader import label, policy_of
+    from scenarios.policy_loader import blaming, label, policy_of
     from scenarios.result_folder import check_free
     from scenarios.run.log import RUN
     from scenarios.show.run_page import figure_table
@@ -65,7 +65,8 @@ def run_command(
     chosen = load(scenario)
     given = {"seed": own_seed(scenario), **given}
     spec = RunSpec(**given, channel=options.channel_of(chosen, **channel))
-    policy_of(spec.policy)
+    with blaming(spec.policy, "loading"):
+        policy_of(spec.policy)
     if listen and spec.bus == "memory":
         raise FleetError(f"--listen needs --bus zenoh (got {listen} and {spec.bus}).")
     where = out or Path("runs") / f"{chosen.name}-{label(spec.policy).replace(':', '-')}-{spec.seed}"

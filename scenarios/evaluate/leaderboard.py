@@ -5,15 +5,19 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
+import numpy as np
 
 from fleet.bus.exchange.channel import PERFECT
-from fleet.engine.observe import PEAK_HIGH_C, PEAK_LOW_C
+from fleet.engine.batch import RewardWeights
+from fleet.engine.observe import PEAK_HIGH_C
 from fleet.errors import FleetError, printable
 from fleet.files import atomic_path
+from fleet.seeding import shift_seeds
 from scenarios.evaluate.references import ShiftReference
 from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
 from scenarios.evaluate.scores import Shift, SuiteScores, normalised, ranked, references_of, scores_of
@@ -22,10 +26,11 @@ from scenarios.evaluate.study import CARD, Row, RowKey, suite_of
 from scenarios.policy_loader import is_built_in, is_on_bus, label, scope_of
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.result_folder import disk_errors
+from scenarios.spec.jobs import draw_jobs, weights_of
 from scenarios.spec.options import DECISION_LIMIT_S, RiskName
 from scenarios.spec.schema import SplitName
 from scenarios.suite.instances import JUDGED
-from scenarios.suite.splits import ManifestLine, cell_of_instance, line_of, manifest
+from scenarios.suite.splits import ManifestLine, cell_of_instance, instance_of, line_of, manifest
 
 DIGITS = 10
 """Significant digits of figures in a file."""
@@ -99,6 +104,17 @@ class BoardResult(msgspec.Struct, frozen=True, kw_only=True):
     def failures(self) -> int:
         """Shifts in which the policy failed."""
         return sum(row.figures is None for row in self.rows)
+
+    @property
+    def faults(self) -> float | None:
+        """Mean over the shifts in which the policy did not fail; None if there is none."""
+        values = [row.figures[FIGURES.index("faults")] for row in self.rows if row.figures]
+        return sum(values) / len(values) if values else None
+
+    @property
+    def faults_text(self) -> str:
+        """`faults` as a cell of a table."""
+        return "" if self.faults is None else f"{self.faults:.2f}"
 
     def study_rows(self) -> list[Row]:
         """As a study has them."""
@@ -212,14 +228,41 @@ def _problems_of_shift(row: ResultLine, line: ManifestLine, known: ShiftReferenc
         yield f"has counts that are no whole numbers ({', '.join(counts)})"
     if max(own["above_warning_min"], own["hot_surface_min"]) > longest_min + SLACK:
         yield f"has more minutes above a limit than its arms work ({longest_min:g})"
-    if not PEAK_LOW_C <= own["peak_c"] <= PEAK_HIGH_C:
-        yield f"has a hottest motor of {own['peak_c']:g} °C, not within {PEAK_LOW_C:g} to {PEAK_HIGH_C:g}"
-    if reward > own["value"] + SLACK * (1 + own["value"]):
-        yield f"has a reward of {reward:.4g}, above the finished value {own['value']:.4g}: all else is a cost"
+    limits = _limits_of(line)
+    if not limits.ambient_c - SLACK <= own["peak_c"] <= PEAK_HIGH_C:
+        yield f"has a hottest motor of {own['peak_c']:g} °C, not within {limits.ambient_c:g} to {PEAK_HIGH_C:g}"
+    if own["value"] > limits.value + SLACK * limits.value:
+        yield f"has a finished value of {own['value']:.4g}, but its jobs have {limits.value:.4g}"
+    weights = limits.weights
+    costs = -weights.faults * own["faults"] - weights.above_warning * own["above_warning_min"]
+    if reward > own["value"] - costs + SLACK * (1 + own["value"] + costs):
+        yield (
+            f"has a reward of {reward:.4g}, above the finished value {own['value']:.4g} less {costs:.4g} for faults "
+            "and minutes above the warning limit: all else is a cost"
+        )
     if known and reward < (least := known.random - MOST_LOSS * max(known.unit, known.upper - known.random)):
         yield f"has a reward of {reward:.4g}, below what the worst policy could lose ({least:.4g})"
     if known and reward > known.upper + SLACK * (1 + abs(known.upper)):
         yield f"has a reward of {reward:.4g}, above the upper bound {known.upper:.4g}, which no policy exceeds"
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """What the jobs, the reward and the ambient temperature of an instance allow."""
+
+    value: float
+    """Of all its jobs."""
+    weights: RewardWeights
+    ambient_c: float
+    """Lowest ambient temperature."""
+
+
+@cache
+def _limits_of(line: ManifestLine) -> _Limits:
+    made = instance_of(line)
+    jobs = draw_jobs(made.scenario, shift_seeds(np.random.SeedSequence(made.seed))[0])
+    coolest_c = min(ambient_c for _, ambient_c in made.scenario.ambient.points)
+    return _Limits(sum(job.value for job in jobs), weights_of(made.scenario), coolest_c)
 
 
 def write(submission: BoardResult, folder: Path) -> Path:
@@ -248,21 +291,30 @@ def read(path: Path) -> BoardResult:
     Raises:
         FleetError: it is too large, or a line is no part of a result.
     """
-    number = 1
+    number, line = 1, ""
     try:
         if path.stat().st_size > MOST_BYTES:
             raise FleetError(f"'{path}': a result has at most {MOST_BYTES} bytes.")
-        first, *rest = path.read_text(encoding="utf-8").rstrip("\n").split("\n")
-        card, rows = msgspec.json.decode(first, type=Card), list[ResultLine]()
+        line, *rest = path.read_text(encoding="utf-8").rstrip("\n").split("\n")
+        card, rows = msgspec.json.decode(line, type=Card), list[ResultLine]()
         for line in rest:
             number += 1
             rows.append(msgspec.json.decode(line, type=ResultLine))
     except OSError as error:
         raise FleetError(f"Cannot read '{path}': {error.strerror}.") from error
     except (ValueError, msgspec.DecodeError) as error:
-        why = f"line {number}: {printable(str(error))}"
+        why = f"line {number}: {printable(_problem_text(error, line))}"
         raise FleetError(f"'{path}' is no result of `thermofleet leaderboard --submit`: {why}.") from error
     return BoardResult(card=card, rows=tuple(rows))
+
+
+def _problem_text(error: Exception, line: str = "") -> str:
+    """What is wrong with a line, without regular expressions."""
+    named = re.search(r"NaN|-?Infinity", line)
+    if named and not isinstance(error, msgspec.ValidationError):
+        return f"{error}: {named[0]} is no number of JSON"
+    text = str(error).replace(f"matching regex {PLAIN!r}", "without control characters and | < > `")
+    return re.sub(r"matching regex '.*'", "of 16 hexadecimal digits", text)
 
 
 def submissions_of(card: Mapping[str, Any], rows: Sequence[Row], author: str, about: str) -> list[BoardResult]:
@@ -303,10 +355,15 @@ def submissions_of(card: Mapping[str, Any], rows: Sequence[Row], author: str, ab
             try:
                 head = msgspec.convert(header, Card)
             except msgspec.ValidationError as error:
-                raise FleetError(f"The result of '{policy}' cannot be written: {error}.") from error
+                raise FleetError(f"The result of '{policy}' cannot be written: {_problem_text(error)}.") from error
             lines = tuple(result_line(row, card["instances"][row.key.instance]) for row in own)
             made.append(BoardResult(card=head, rows=lines))
     return made
+
+
+def failed_text(count: int) -> str:
+    """That a policy failed in shifts, as the end of a sentence; "" for none."""
+    return f", {count} failed shift{'s' * (count > 1)}, which count as random" if count else ""
 
 
 BASELINE, SOURCE = "wsept", "twin"
@@ -330,13 +387,20 @@ class Board:
         """Names of the submissions, the best first."""
         return ranked(self.scores)
 
+    def as_json(self) -> dict[str, Any]:
+        """The scores, with mean faults and failed shifts of each submission (Any: JSON values)."""
+        described = asdict(self.scores)
+        for name, entry in self.entries.items():
+            described["policies"][name] |= {"faults": entry.faults, "failed": entry.failures}
+        return described
+
     @property
     def summary(self) -> str:
         """The policy with the highest mean score of each scope, in a sentence."""
         best: dict[str, str] = {}
         for name in self.order:
-            card = self.entries[name].card
-            best.setdefault(card.scope, f"`{card.policy}` ({self.scores.policies[name].mean.text()})")
+            card, failed = self.entries[name].card, failed_text(self.entries[name].failures)
+            best.setdefault(card.scope, f"`{card.policy}` ({self.scores.policies[name].mean.text()}{failed})")
         texts = [f"{scope} {best[scope]}" for scope in ("central", "arm") if scope in best]
         return f"Highest mean score of scope {', of scope '.join(texts)}."
 

@@ -2,6 +2,7 @@
 
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 
+import signal
 from concurrent.futures import Future
 from typing import Any
 
@@ -17,6 +18,9 @@ START_S = 60.0
 
 @ray.remote(num_cpus=1, max_restarts=0)
 class _Runner:
+    def __init__(self) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # as other workers do
+
     def ready(self) -> None:
         """Return when it runs."""
 

@@ -20,7 +20,7 @@ from fleet.env.lookahead import CellSimulator
 from fleet.env.validation import actions_of
 from fleet.env.vector import BatchEnv, Obs
 from scenarios.evaluate.statistics import FigureKind
-from scenarios.policy_loader import OnBus, failure, policy_at
+from scenarios.policy_loader import OnBus, failure, is_ctrl_c, policy_at
 from scenarios.prepare.batch import library_of
 from scenarios.prepare.fleet import Fleet, as_known, simulator_of
 from scenarios.run.metrics import HeatUse, common_figures
@@ -122,9 +122,9 @@ def play(
         try:
             with limit.decision():
                 yield
-        except KeyboardInterrupt:
-            raise
         except BaseException as error:  # of the policy
+            if is_ctrl_c(error):
+                raise
             for e in envs:
                 results[e], running[e] = ShiftResult(None, 0, error, float(time_s[e])), False
 

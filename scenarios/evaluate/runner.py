@@ -205,6 +205,7 @@ def run_study(
         if ray is None or any(map(is_trained, study.sources)):
             _prepare_once(units, settings, progress)
         count = len(wanted) - sum(len(unit.case.seeds) for unit in units)
+        progress("comparing", Count(count, len(wanted)))
         for rows in _run(units, settings, workers, ray, tell):
             store.add(rows)
             count += len(rows)

@@ -82,7 +82,12 @@ def _joined(out: Path, card: Mapping[str, Any]) -> dict[str, Any]:
         for name in NAMED:
             dict(known[name])
     except (FileNotFoundError, ValueError, KeyError, TypeError) as error:
-        raise FleetError(f"'{out}' holds other files; --out needs a new folder or that of an earlier study.") from error
+        what = "holds other files"
+        if not isinstance(error, FileNotFoundError):
+            what = f"has a damaged {CARD}"
+        elif (out / RESULTS).exists():
+            what = f"has {RESULTS}, but no {CARD}"
+        raise FleetError(f"'{out}' {what}; --out needs a new folder or that of an earlier study.") from error
     joined = dict(card)
     for name, value in card.items():
         if name in NAMED:

@@ -288,7 +288,7 @@ def check_policy(name: str, limit_s: float | None = None) -> None:
         raise FleetError(f"The policy '{name}' takes longer than {limit_s:g} s to load (--decision-limit).") from error
     except FleetError:
         raise
-    except Exception:  # of its code
+    except (Exception, SystemExit):  # of its code
         return
 
 

@@ -27,8 +27,6 @@ Range = tuple[float, float, float]
 CHOICE = "Intervals are not adjusted for the choice of the best policy; its significance is (Bonferroni)."
 MOST_CURVES = 8
 """Policies in the chart of profiles: the best ones, and the baseline."""
-MOST_FAILURES, MOST_TRACES = 20, 8
-"""Failed shifts of a page with their traceback, and failed policies of a text with that of their first failure."""
 THRESHOLDS = np.linspace(-0.5, 1.1, 81)
 WORST = -1.5
 """Scores below are cut in charts."""
@@ -44,9 +42,9 @@ def score_table(scores: SuiteScores, labels: Mapping[str, str] | None = None) ->
     return Table(head=HEADS, rows=tuple(rows))
 
 
-def narrow_score_tables(scores: SuiteScores, labels: Mapping[str, str] | None = None) -> tuple[Table, Table]:
+def narrow_score_tables(scores: SuiteScores) -> tuple[Table, Table]:
     """The table of scores in two parts, each narrow enough for 80 columns."""
-    table = score_table(scores, labels)
+    table = score_table(scores)
     return table.select(0, 1, 2, 3, 7), table.select(0, 4, 5, 6)
 
 
@@ -60,11 +58,21 @@ def result_text(result: Comparison) -> Group:
         parts.append(Text(_no_scores(result)))
     if illegal := _illegal([result]):
         parts.append(Text(illegal))
-    first = {each.policy: each for each in reversed(result.failures)}
-    for policy, count in Counter(each.policy for each in result.failures).most_common(MOST_TRACES):
-        shifts = f"{label(policy)} failed in {count} shift{'s' * (count > 1)}, first in"
-        parts.append(Text(f"\n{shifts} {_failure_text(first[policy])}\n{first[policy].trace}".rstrip()))
+    parts += [Text(f"\n{sentence}\n{trace}".rstrip()) for sentence, trace in _failures([result])]
     return Group(*parts)
+
+
+def _failures(results: Sequence[Comparison]) -> list[tuple[str, str]]:
+    """Number of failures of each policy and its first one, a sentence and a traceback; the most failures first."""
+    failures = [each for result in results for each in result.failures]
+    first = {each.policy: each for each in reversed(failures)}
+    return [
+        (
+            f"{label(policy)} failed in {count} shift{'s' * (count > 1)}, first in {_failure_text(first[policy])}",
+            first[policy].trace,
+        )
+        for policy, count in Counter(each.policy for each in failures).most_common()
+    ]
 
 
 def _no_scores(result: Comparison) -> str:
@@ -179,12 +187,9 @@ def _sections(judged: Judged) -> Iterator[Section]:
         scope, *groups = result.table.split()
         sentences = (f"{about} {settings}", *result.table.notes)
         yield Section(key=key, title=title, sentences=sentences, details=(*groups, scope))
-    failures = [each for result in judged.results for each in result.failures]
-    sentences = [_illegal(judged.results) or "No illegal action.", *(["No policy failed."] if not failures else [])]
-    if len(failures) > MOST_FAILURES:
-        sentences.append(f"{len(failures) - MOST_FAILURES} more are in results.parquet.")
-    traces = tuple((f"{label(each.policy)}, {_failure_text(each)}", each.trace) for each in failures[:MOST_FAILURES])
-    yield Section(key="failures", title="Failures and illegal actions", sentences=tuple(sentences), details=traces)
+    failures = tuple(_failures(judged.results))
+    sentences = (_illegal(judged.results) or "No illegal action.", *(["No policy failed."] if not failures else []))
+    yield Section(key="failures", title="Failures and illegal actions", sentences=sentences, details=failures)
     hashes = [f"{digest}  {name}" for name, digest in judged.card["instances"].items()]
     about = "Every shift is a row of results.parquet beside this page; study.json has these hashes."
     details = ((f"Hashes of {len(hashes)} scenario{'s' * (len(hashes) > 1)}", "\n".join(hashes)),)
@@ -274,7 +279,7 @@ def _reward_verdict(results: Sequence[Comparison]) -> Iterator[str]:
             difference = result.lead if other == others[0] else result.figures[best]["reward"].to_base
             assert difference is not None
             significant = difference.excludes_zero and _significant(difference.p, len(others))
-            doubt = "" if significant else " (not significant)"
+            doubt = "" if significant else " (not significant)" if result.draws > 1 else " (one seed: not tested)"
             more.append(f"{difference.text(1)} more than {role} {label(other)}{doubt}")
         rewards = {name: (each["reward"].to_base, each["reward"].p_holm) for name, each in result.figures.items()}
         sentences = [f"{'; '.join([f'{label(best)} has the most reward, {reward}', *more])}.", *_below(rewards, base)]

@@ -300,7 +300,7 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
     if begin_s + took_s > late.due_s:
         wait_s = late.due_s - begin_s
         due = f"{duration(abs(wait_s))} {'after' if wait_s >= 0 else 'before'} its release"
-        return f"its work takes {duration(took_s)}, and it was due {due}"
+        return f"its work takes {duration(took_s)}, and it was due {due}" if own else f"it was due {due}"
     offers = [offer for offer in log.offers if offer.job == late.job]
     offers = offers or [offer for offer in log.offers if stream_of(offer.job) == stream_of(late.job)]
     able = [arm for arm in log.arms if any(offer.feasible and offer.arm == arm for offer in offers)]

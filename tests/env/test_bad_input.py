@@ -22,7 +22,7 @@ def test_actions_may_be_numpy_integers(make, play) -> None:
     assert play.plain(env.step(arrays)) == play.plain(other.step({"arm_0": 1, "arm_1": 2, "arm_2": 0}))
 
 
-@pytest.mark.parametrize("action", [1.0, np.array(0.0), "1", None, True, np.array([0, 1]), []])
+@pytest.mark.parametrize("action", [1.0, np.array(0.0), "1", None, True, np.array([0, 1]), [], [1], (1,)])
 def test_non_integer_actions_are_refused_without_effect(make, play, action) -> None:
     env, other = make(), make()
     env.reset(seed=1)

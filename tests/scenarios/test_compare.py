@@ -24,7 +24,7 @@ from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
 from scenarios.cli import options
 from scenarios.evaluate import runner
-from scenarios.evaluate.comparison import Comparison, compare, comparisons, figures_table, scores_over_all
+from scenarios.evaluate.comparison import Comparison, Failed, compare, comparisons, figures_table, scores_over_all
 from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
 from scenarios.evaluate.scores import Shift
 from scenarios.evaluate.sources import _Random
@@ -32,7 +32,7 @@ from scenarios.evaluate.statistics import Figure, interval
 from scenarios.evaluate.store import read_rows
 from scenarios.evaluate.study import Case, Row, RowKey, Study, suite_label
 from scenarios.prepare.randomisation import Randomisation
-from scenarios.show.comparison_page import Judged, comparison_page, points, spans, verdict
+from scenarios.show.comparison_page import Judged, comparison_page, points, result_text, spans, verdict
 from scenarios.spec.load import load
 from scenarios.spec.schema import Scenario
 from scenarios.suite.splits import manifest
@@ -65,7 +65,7 @@ def test_what_takes_no_time_needs_no_worker(scenario, plans, monkeypatch):
     monkeypatch.setattr("scenarios.evaluate.runner.LocalWorker", None)
     told: list[tuple[str, float]] = []
     compared(scenario, plans, workers=2, progress=lambda stage, share: told.append((stage, share)))
-    assert [share for stage, share in told if stage == "comparing"] == [0.5, 1.0]
+    assert [share for stage, share in told if stage == "comparing"] == [0.0, 0.5, 1.0]
 
 
 @pytest.mark.parametrize(
@@ -261,6 +261,20 @@ def test_the_first_policy_that_did_not_fail_takes_the_place_of_a_baseline_that_d
     assert "Normalised score" in comparison_page(about)
 
 
+def test_text_and_page_name_every_failed_policy_once_with_its_number_of_failures(study: Study):
+    about = judged(study, rows_of(study), {})
+    failures = [
+        Failed(f"mine.py:Bad{n}", "quickstart", 0, 0, seed, "Oops", "line 3") for n in range(9) for seed in (3, 4)
+    ]
+    about = replace(about, results=[replace(about.results[0], failures=tuple(failures))])
+    console = Console(width=200)
+    with console.capture() as told:
+        console.print(result_text(about.results[0]))
+    for text in (told.get(), comparison_page(about)):
+        for n in range(9):
+            assert text.count(f"Bad{n} failed in 2 shifts, first in quickstart, fleet 0, training 0, seed 3: Oops") == 1
+
+
 def test_the_best_of_several_must_be_significant_among_them(study: Study):
     about = judged(study, rows_of(study), {})
     (result,) = about.results
@@ -268,6 +282,13 @@ def test_the_best_of_several_must_be_significant_among_them(study: Study):
     for p, said in ((0.016, "wspt."), (0.02, "wspt (not significant).")):  # of three
         first, _ = verdict(replace(about, results=[replace(result, lead=replace(result.lead, p=p))]))
         assert said in first
+
+
+def test_a_difference_of_one_seed_is_called_untested(study: Study):
+    single = replace(study, cases=[replace(study.cases[0], seeds=(0,))])
+    first, _ = verdict(judged(single, rows_of(single), {}, "fifo"))
+    assert first.count("(one seed: not tested)") == 2
+    assert "significant" not in first
 
 
 @pytest.mark.parametrize(

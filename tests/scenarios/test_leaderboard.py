@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import msgspec
@@ -30,7 +30,7 @@ from scenarios.evaluate.study import Row, Study, suite_of
 from scenarios.policy_loader import policy_of, scope_of
 from scenarios.suite.splits import manifest
 
-BLANK = Outcome(**dict.fromkeys(FIGURES, 0.0) | {"value": 50.0})
+BLANK = Outcome(**dict.fromkeys(FIGURES, 0.0) | {"value": 50.0, "peak_c": 60.0})
 
 
 def reference(line) -> ShiftReference:
@@ -87,6 +87,13 @@ def test_a_study_of_a_whole_split_becomes_a_file_for_each_policy_and_a_table(stu
     (first,) = re.findall(r"\| 1 \|.*", text)
     assert [cell.strip() for cell in first.split("|")][2:4] == ["`wsept`", scope_of("wsept")]
     assert "200 of 200 instances; differences to `wsept` (oracle)." in text
+    for shown in (thermofleet("leaderboard", sent).out, text):
+        assert "`wsept` (0.75 [" in shown
+        assert "50 failed shifts, which count as random)" in " ".join(shown.split())
+    *_, row = [line for line in thermofleet("leaderboard", sent).out.splitlines() if line.startswith("wsept")]
+    assert row.split()[-2:] == ["0.00", "50"]
+    in_json = json.loads(thermofleet("leaderboard", sent, "--json").out)["policies"]["test-wsept-oracle"]
+    assert (in_json["faults"], in_json["failed"]) == (0.0, 50)
     assert board_text(sent, "validation") == "No results on the split validation."
     assert thermofleet("leaderboard", tmp_path / "absent").code == 2
 
@@ -135,11 +142,14 @@ FORGED = {
     "another process": (changed(None, policy="bus:mine", policy_hash=""), None),
     "files of another process": (changed(None, policy="bus:mine"), r"\(bus:NAME has none\)"),
     "more than the value": (changed(7, value=11.9), r"test/0007 has a reward of 12, above the finished value 11\.9"),
+    "more value than its jobs have": (changed(7, value=1e6), r"has a finished value of 1e\+06, but its jobs have \d"),
+    "faults without their price": (changed(7, faults=1e6), "above the finished value 50 less .* for faults"),
+    "minutes without their price": (changed(7, above_warning_min=1e3), "above the finished value 50 less 50 for"),
     "no number": (changed(7, value=float("nan")), "needs 11 figures of at most 1e\\+09"),
     "below 0": (changed(7, faults=-1.0), "a figure below 0"),
     "half a fault": (changed(7, faults=0.5), "counts that are no whole numbers"),
     "more minutes than the shift": (changed(7, above_warning_min=1e6), "more minutes above a limit"),
-    "a motor below absolute zero": (changed(7, peak_c=-500.0), "a hottest motor of -500 °C"),
+    "a motor cooler than the air": (changed(7, peak_c=1.0), "a hottest motor of 1 °C, not within"),
     "an endless loss": (changed(7, reward=-1e9), "a reward of -1e\\+09, below what the worst policy could lose"),
     "neither figures nor error": (changed(7, figures=None), "needs either figures or an error"),
 }
@@ -155,7 +165,7 @@ def good(study: Study) -> BoardResult:
         manifest=leaderboard.manifest_hash("test"), code_hash="a" * 16, policy_hash="c" * 16, risk="rc",
         versions=versions,
     )  # fmt: skip
-    figures = [12.0 if name == "reward" else 50.0 if name == "value" else 0.0 for name in FIGURES]
+    figures = [*astuple(replace(BLANK, reward=12.0))]
     rows = [
         ResultLine(instance=case.name, scenario=scenarios[case.name], seed=case.seeds[0], training=0, figures=figures,
                illegal=0)
@@ -199,6 +209,17 @@ def test_a_file_is_read_as_it_was_written_and_nothing_else_is(good: BoardResult,
     ):
         path.write_text("\n".join([bad, *lines[1:]]), encoding="utf-8")
         with pytest.raises(FleetError, match="is no result of `thermofleet leaderboard --submit`"):
+            read(path)
+    for bad, said in (
+        (
+            json.dumps(json.loads(lines[0]) | {"author": "a | b"}),
+            "without control characters and | < > ` - at `$.author`",
+        ),
+        (json.dumps(json.loads(lines[0]) | {"code_hash": "?"}), "of 16 hexadecimal digits - at `$.code_hash`"),
+        (lines[0].replace("[0", "[NaN").replace('"trainings":1', '"trainings":NaN'), ": NaN is no number of JSON"),
+    ):
+        path.write_text("\n".join([bad, *lines[1:]]), encoding="utf-8")
+        with pytest.raises(FleetError, match=re.escape(said)):
             read(path)
     path.write_text("\n".join([*lines[:2], lines[2][:20], *lines[3:]]), encoding="utf-8")
     with pytest.raises(FleetError, match="line 3: "):

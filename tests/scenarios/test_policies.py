@@ -12,6 +12,7 @@ from agents.rules import LeastDifficulty
 from fleet.errors import FleetError
 from scenarios.evaluate.study import check_policy
 from scenarios.policy_loader import PolicyFailed, arm_policy_of, failure, label, policy_of, scope_of
+from tests.scenarios.conftest import QUICK
 from tests.waiting import PATIENCE_S
 
 
@@ -103,6 +104,8 @@ def test_what_is_no_policy_is_said_in_words(own, name, said):
         ("\nimport json\njson.loads('')\n", "JSONDecodeError in line 3: Expecting value"),
         ("import no_such_module\n", r"ModuleNotFoundError in line 1: No module named 'no_such_module'\.$"),
         ("\0", r"SyntaxError: source code .* null bytes\.$"),
+        ("import sys\nsys.exit()\n", r"SystemExit in line 2\.$"),
+        ("raise SystemExit('no licence')\n", r"SystemExit in line 1: no licence\.$"),
     ],
 )
 def test_an_own_file_that_cannot_be_loaded_is_said_with_its_line(tmp_path, text, said):
@@ -110,6 +113,22 @@ def test_an_own_file_that_cannot_be_loaded_is_said_with_its_line(tmp_path, text,
     file.write_text(text)
     with pytest.raises(FleetError, match=f"mine.py' cannot be loaded: {said}"):
         policy_of(f"{file}:Idle")
+
+
+@pytest.mark.parametrize("error", ["SystemExit", "ValueError"])
+def test_a_file_or_a_function_that_ends_the_process_is_a_policy_that_fails(
+    thermofleet, small_toml, tmp_path, monkeypatch, error
+):
+    (tmp_path / "loaded.py").write_text(f"raise {error}('bye')\n")
+    (tmp_path / "made.py").write_text(f"def make(): raise {error}('bye')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    file, module, made = f"{tmp_path / 'loaded.py'}:A", "loaded:A", f"{tmp_path / 'made.py'}:make"
+    not_loaded = f"cannot be loaded: {error}"
+    for name, said in ((file, not_loaded), (module, not_loaded), (made, f"failed in loading: {error}: bye")):
+        assert thermofleet("run", small_toml, "--policy", name, *QUICK[:4]).refused(said)
+    for name in (file, module):
+        assert thermofleet("compare", small_toml, "--policies", name, "--difficulty", "blind").refused(not_loaded)
+    check_policy(made)  # it fails shift by shift
 
 
 @pytest.mark.parametrize(

@@ -74,7 +74,7 @@ def test_the_same_seed_gives_the_same_shift_without_an_illegal_action(fleet, pol
     assert one.metrics.illegal_actions == 0
 
 
-@pytest.mark.parametrize("form", ["[{}]", "np.array([{}])", "np.int8({})"])
+@pytest.mark.parametrize("form", ["np.array({})", "np.array([{}])", "np.int8({})"])
 def test_an_action_may_be_an_array_of_one_integer(fleet, result, tmp_path, form):
     file = tmp_path / "mine.py"
     file.write_text(

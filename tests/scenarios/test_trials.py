@@ -15,7 +15,7 @@ from scenarios.evaluate import runner, sources
 from scenarios.evaluate.comparison import comparison_of, comparisons
 from scenarios.evaluate.rollout import FIGURES, outcomes
 from scenarios.evaluate.store import RESULTS, UNFINISHED, opened, read_rows
-from scenarios.evaluate.study import Case, RowKey, Study, Unit, policy_hash, seeds_of_instance
+from scenarios.evaluate.study import CARD, Case, RowKey, Study, Unit, policy_hash, seeds_of_instance
 from scenarios.policy_loader import label
 from scenarios.prepare import fleet as preparing
 from scenarios.prepare.arms import plan_arms
@@ -114,6 +114,21 @@ def test_a_folder_of_something_else_is_refused(scenario, plans, tmp_path, bad):
         runner.run_study(study, out=tmp_path, cache_dir=plans, workers=1)
 
 
+def test_a_damaged_or_missing_card_is_named(scenario, tmp_path):
+    study, out = study_of(scenario), tmp_path / "out"
+    with opened(out, study.card):
+        pass
+    (out / CARD).write_text("{", encoding="utf-8")
+    with (
+        pytest.raises(FleetError, match=r"has a damaged study\.json; --out needs a new folder"),
+        opened(out, study.card),
+    ):
+        pass
+    (out / CARD).unlink()
+    with pytest.raises(FleetError, match=r"has results\.parquet, but no study\.json"), opened(out, study.card):
+        pass
+
+
 @pytest.mark.ci_slow
 def test_policies_that_fail_are_told_and_the_others_go_on(scenario, plans, bad, tmp_path):
     names = {name: f"{bad}:{name}" for name in ("Raises", "Nonsense", "Stuck", "Illegal", "Idle")}
@@ -169,6 +184,27 @@ def test_failed_shifts_are_run_again_and_no_others(scenario, plans, tmp_path):
     assert failed() == [False] * 4
     assert told == ["Running again what failed before: 2 shifts."]
     assert not any(row.error for row in read_rows(tmp_path / "out"))
+
+
+def test_an_interruption_of_a_policy_is_its_failure_and_ctrl_c_is_none(thermofleet, small_toml, tmp_path):
+    policy = tmp_path / "stops.py"
+    policy.write_text(
+        "import os, signal, threading\n"
+        "class Raises:\n    scope = 'central'\n    def reset(self, rng): pass\n"
+        "    def act(self, seen): raise KeyboardInterrupt\n"
+        "class Pressed(Raises):\n    def act(self, seen):\n"
+        "        for process in (os.getpid(), os.getppid()): os.kill(process, signal.SIGINT)\n"
+        "        threading.Event().wait()\n",
+        encoding="utf-8",
+    )
+    how = (small_toml, "--difficulty", "blind", "--seeds", 2, "--workers", 1, "--policies")
+    told = thermofleet("compare", *how, f"{policy}:Raises").succeeded().out
+    assert (
+        "Raises failed in 2 shifts, first in heat, fleet 0, training 0, seed 0: KeyboardInterrupt (at 0 s"
+        in " ".join(told.split())
+    )
+    pressed = thermofleet("compare", *how, f"{policy}:Pressed")
+    assert (pressed.code, pressed.err.partition(":")[0]) == (130, "Interrupted while comparing")
 
 
 @pytest.mark.parametrize("is_package", [False, True])

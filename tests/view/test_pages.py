@@ -15,9 +15,12 @@ from playwright.sync_api import Browser, Page, sync_playwright
 from fleet.arm.kinematics import REACH_M
 from scenarios.run.log import RunLog, open_run
 from scenarios.show.layout import LayoutReport, shoulder_m
+from scenarios.show.page import Page as Report
+from scenarios.show.page import Section
 from scenarios.show.plan import plan_page
 from scenarios.show.run_page import runs_page
 from scenarios.spec.load import load
+from scenarios.table import Table
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
@@ -29,6 +32,11 @@ COLOURS = """element => {
   return [ink, behind ? getComputedStyle(behind).backgroundColor : "rgb(255, 255, 255)"];
 }"""
 """Colour of the words of an element, and of what is behind them."""
+HEIGHT_OF_TEXT = """element => {
+  const range = document.createRange();
+  range.selectNodeContents(element);
+  return range.getBoundingClientRect().height;
+}"""
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
@@ -150,6 +158,24 @@ def test_a_narrow_page_overprints_nothing(page: Page) -> None:
         assert legend["y"] + legend["height"] <= plot["y"] + 1
     overflow = page.locator("html").evaluate("e => e.scrollWidth - e.clientWidth")
     assert overflow <= 0
+
+
+def test_a_narrow_table_breaks_no_short_word_and_scrolls_in_its_box(browser: Browser) -> None:
+    words = (
+        "rush_hold_part-006",
+        "2:05:09",
+        "54 min 51 s",
+        "finished",
+        "14 other jobs went first on arm_1, 13 shorter",
+    )
+    table = Table(head=("job", "due", "late by", "state", "why"), rows=(words,), numbers=False)
+    page = browser.new_page(viewport={"width": 390, "height": 850})
+    page.set_content(Report(title="a", sections=[Section(tables=(table,))]).html())
+    for word in ("2:05:09", "finished"):
+        height_px = page.get_by_role("cell", name=word).evaluate(HEIGHT_OF_TEXT)
+        assert height_px < 30, word  # one line
+    assert page.locator("html").evaluate("e => e.scrollWidth - e.clientWidth") <= 0
+    page.close()
 
 
 def luminance(rgb: np.ndarray) -> np.ndarray:
