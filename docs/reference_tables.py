@@ -194,7 +194,7 @@ def _limit_table() -> str:
         ),
         (f"{MOST_REQUEST_BYTES:,} bytes", "a request to `policy/{policy}/act`"),
         (f"{state.limit_hz:g} a second", "`state` messages of one session; the router drops more (`--state-hz`)"),
-        (f"{MOST_JOBS}", "jobs in one message; a `Status` lists open jobs before closed ones"),
+        (f"{MOST_JOBS}", "jobs in one message; more come in several pages of a `Status`"),
         (f"{MAX_OPEN_JOBS:,}", "open jobs of one auctioneer"),
         (f"{longest}", "characters of a job's name"),
         (f"{LONGEST_GRASP_S:g} s", "`dwell_s` of a pick_place or sort"),

@@ -306,8 +306,18 @@ class BusClient(Connection):
         self, key: str, request: msgspec.Struct, kind: type[Reply], *, timeout_s: float, most: int = MOST_REPLIES
     ) -> Replies[Reply]:
         """As `query`, and serve until the replies are complete."""
+        query = partial(self.query, key, request, kind, timeout_s=timeout_s, most=most)
+        return self.wait(query, timeout_s)
+
+    def wait(self, query: Callable[[Callable[[Replies[Reply]], None]], None], timeout_s: float) -> Replies[Reply]:
+        """Begin a query, and serve until its replies are complete.
+
+        Args:
+            query: Called with the handler of the replies.
+            timeout_s: Real seconds of the query.
+        """
         complete: list[Replies[Reply]] = []
-        self.query(key, request, kind, complete.append, timeout_s=timeout_s, most=most)
+        query(complete.append)
         deadline_s = time.monotonic() + timeout_s + 1.0
         while not complete and time.monotonic() < deadline_s:
             self.serve(deadline_s)

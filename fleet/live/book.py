@@ -373,14 +373,18 @@ class JobBook(TimedState[BookRecord]):
         """Return the names of jobs that still need an arm or a report."""
         return [name for name, entry in self.jobs.items() if entry.state not in SETTLED]
 
-    def status(self, names: Iterable[str] = ()) -> list[JobStatus]:
-        """Return the status of these jobs, without unknown ones; of all jobs if none is named."""
+    def entries(self, names: Iterable[str] = ()) -> list[JobEntry]:
+        """Return these jobs, without unknown ones; all jobs if none is named."""
         wanted = dict.fromkeys(names) or [*self.in_order, *self._unknown]
         return [
-            self.status_of(self.jobs[name])
+            self.jobs[name]
             for name in wanted
             if name in self.jobs and (name not in self._unknown or self.jobs[name].is_settled)
         ]
+
+    def status(self, names: Iterable[str] = ()) -> list[JobStatus]:
+        """Return the status of these jobs, without unknown ones; of all jobs if none is named."""
+        return [self.status_of(entry) for entry in self.entries(names)]
 
     def status_of(self, entry: JobEntry) -> JobStatus:
         """Return the status of a job."""

@@ -2,14 +2,18 @@
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from operator import itemgetter
 from typing import TypeVar
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
+    MOST_JOBS,
     Clock,
     ClockRequest,
     JobStatus,
@@ -22,7 +26,8 @@ from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest
 from fleet.errors import Refused
 from fleet.live.book import JobBook
-from fleet.live.job_rules import status_reply
+from fleet.live.job_rules import Position, fitting
+from fleet.live.records import JobEntry
 
 _LOG = logging.getLogger(__name__)
 
@@ -81,7 +86,11 @@ class JobDesk(ABC):
         return {}
 
     @abstractmethod
-    def _statuses(self, names: tuple[str, ...]) -> Iterable[JobStatus]: ...
+    def _entries(self) -> Sequence[JobEntry]:
+        """Return the jobs whose status everybody may know."""
+
+    @abstractmethod
+    def _status_of(self, entries: Sequence[JobEntry]) -> Sequence[JobStatus]: ...
     @abstractmethod
     def _submit(self, submission: Submission) -> SubmissionReply: ...
     @abstractmethod
@@ -91,9 +100,25 @@ class JobDesk(ABC):
 
     def _reply_status(self, request: StatusRequest) -> Status:
         self._check_first()
-        book, statuses = self.book, self._statuses(request.jobs)
-        known = book.taken_space(), book.epoch, book.operations.paused, self._trouble(), self._left_out()
-        return status_reply(self._name, self.time_s, statuses, *known)
+        entries, names, after = self._entries(), frozenset(request.jobs), Position.read(request.after)
+        wanted = ((entry.position, entry) for entry in entries if not names or entry.name in names)
+        following = sorted((each for each in wanted if each[0] > after), key=itemgetter(0))
+        page = following[:MOST_JOBS]
+        book = self.book
+        reply = Status(
+            self._name,
+            self.time_s,
+            (),
+            {arm: tuple(sorted(taken)) for arm, taken in sorted(book.taken_space().items()) if taken},
+            book.epoch,
+            dict(book.operations.paused),
+            self._trouble(),
+            dict(self._left_out()),
+            dict(Counter(entry.state for entry in entries)),
+        )
+        jobs = fitting(reply, self._status_of([entry for _, entry in page]))
+        last = page[len(jobs) - 1][0] if jobs else after
+        return replace(reply, jobs=jobs, next=last.text if len(jobs) < len(following) else "")
 
     def _reply_cell(self, _: CellRequest) -> Cell:
         self._check_first()

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from graphlib import CycleError, TopologicalSorter
 
+from msgspec.structs import replace
+
 from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
@@ -21,8 +23,9 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
-from fleet.bus.protocol.messages import encode
+from fleet.bus.protocol.messages import MOST_COUNT, encode
 from fleet.bus.protocol.operator import Cancel, Controlled, ControlRequest
+from fleet.errors import BusError
 
 _LOG = logging.getLogger(__name__)
 
@@ -35,6 +38,10 @@ STATUS_S = (0.5, 2.0)
 report done cycles and lost results."""
 JOBS_PER_MESSAGE, MAX_BYTES = 64, 48_000
 """A router may drop messages of more than 64 KiB."""
+MAX_PAGES = 256
+"""Pages of statuses that are read at most: about 32,000 jobs, more than an auctioneer keeps."""
+PAGE_S = 0.1
+"""Real seconds to wait for a page at least."""
 
 
 class JobClient:
@@ -131,9 +138,8 @@ class JobClient:
             self._status_s = real_s + STATUS_S[bool(self._auctioneers)]
             names = [name for name in self.open if name not in self._unsubmitted]
             for start in range(0, len(names), JOBS_PER_MESSAGE):
-                asked = StatusRequest(tuple(names[start : start + JOBS_PER_MESSAGE]))
                 done = partial(self._apply_statuses, real_s)
-                self._link.query(keys.of_jobs(fleet, "status"), asked, Status, done, timeout_s=REPLY_S)
+                query_statuses(self._link, done, names[start : start + JOBS_PER_MESSAGE], timeout_s=REPLY_S)
 
     def _watch(self, auctioneer: str, present: bool) -> None:
         (self._auctioneers.add if present else self._auctioneers.discard)(auctioneer)
@@ -175,6 +181,76 @@ class JobClient:
         if known is None or (known.state != "finished" and _progress(known) != _progress(status)):
             self.statuses[status.job] = status
             self._on_change(status)
+
+
+def query_statuses(
+    link: BusClient,
+    done: Callable[[Replies[Status]], None],
+    names: Sequence[str] = (),
+    *,
+    timeout_s: float,
+    most: int = MOST_COUNT,
+) -> None:
+    """Query the state of jobs, of all if none is named; `done` gets the replies, each with the jobs of all its pages.
+
+    A reply whose `next` is not "" is incomplete: its reader has reached a limit, or a page did not arrive in time. Of
+    several participants that reply, which a fleet should not have, only the first is asked for further pages.
+
+    Args:
+        timeout_s: Real seconds for all pages.
+        most: Number of jobs after which no further page is queried.
+
+    Raises:
+        BusError: as `BusClient.query`.
+    """
+    _StatusReader(link, done, tuple(names), time.monotonic() + timeout_s, most).query()
+
+
+class _StatusReader:
+    """Reads the pages of one status request."""
+
+    def __init__(
+        self,
+        link: BusClient,
+        done: Callable[[Replies[Status]], None],
+        names: tuple[str, ...],
+        until_s: float,
+        most: int,
+    ) -> None:
+        self._link, self._done, self._names, self._until_s, self._most = link, done, names, until_s, most
+        self._replies = Replies[Status]()
+        """To the first request."""
+        self._pages: list[Status] = []
+        self._jobs: dict[str, JobStatus] = {}
+
+    def query(self, after: str = "") -> None:
+        """Query the first page, or the next one."""
+        key, request = keys.of_jobs(self._link.fleet, "status"), StatusRequest(self._names, after)
+        left_s = max(PAGE_S, self._until_s - time.monotonic())
+        self._link.query(key, request, Status, self._add, timeout_s=left_s)
+
+    def _add(self, replies: Replies[Status]) -> None:
+        if not self._pages:
+            self._replies = replies
+        page = next(iter(replies.messages.values()), None)
+        if page is not None:
+            self._pages.append(page)
+            self._jobs |= {status.job: status for status in page.jobs}
+        if page is not None and page.next and page.jobs and self._may_query():
+            try:
+                self.query(page.next)
+                return
+            except BusError as error:
+                _LOG.warning("%s", error)
+        if self._pages:
+            messages = self._replies.messages
+            jobs, last = tuple(self._jobs.values()), self._pages[-1]
+            messages[next(iter(messages))] = replace(self._pages[0], jobs=jobs, counts=last.counts, next=last.next)
+        self._done(self._replies)
+
+    def _may_query(self) -> bool:
+        is_in_time = time.monotonic() < self._until_s
+        return is_in_time and len(self._pages) < MAX_PAGES and len(self._jobs) < self._most
 
 
 def _progress(status: JobStatus) -> tuple[object, ...]:

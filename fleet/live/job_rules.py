@@ -10,15 +10,16 @@ from hashlib import blake2b
 from itertools import accumulate
 from math import inf
 from struct import iter_unpack, pack
+from typing import NamedTuple, Self
 
 import networkx as nx
 from msgspec import UNSET, Struct
 from msgspec.structs import replace
 
-from fleet.bus.protocol.auction import MOST_JOBS, SETTLED, Admission, JobSpec, JobStatus, Status
+from fleet.bus.protocol.auction import Admission, JobSpec, JobState, JobStatus, Status
 from fleet.bus.protocol.messages import LISTED_BYTES, State, encode
 from fleet.bus.protocol.operator import Change
-from fleet.errors import listed
+from fleet.errors import Refused, listed, printable
 
 MAX_OPEN_JOBS = 10_000
 """Jobs of one auctioneer that are neither finished nor given up; more are refused."""
@@ -26,7 +27,6 @@ REASON_LENGTHS = (300, 80, 0)
 """Characters of a reason in a reply to a submission: the first of these with which the reply fits into one message."""
 SHIFT_ENDED = "The shift ended before it was done."
 
-NONE: Mapping[str, str] = {}
 MAX_PAST = 100_000
 """Jobs whose names are known after they have left the book."""
 
@@ -335,30 +335,44 @@ def finish_s(status: JobStatus, state: State | None) -> float | None:
     return state.time_s + state.busy_s if at_work and state is not None else None
 
 
-def status_reply(
-    name: str,
-    time_s: float,
-    statuses: Iterable[JobStatus],
-    taken: Mapping[str, Iterable[str]],
-    epoch: str = "",
-    paused: Mapping[str, str] = NONE,
-    trouble: str = "",
-    left_out: Mapping[str, str] = NONE,
-) -> Status:
-    """Return the reply to a status request.
+def urgency(state: JobState, *, shift_ended: bool) -> int:
+    """Return the group of a job where not all have room: 0 needs a person, 1 is in work, 2 waits, 3 has ended."""
+    if state == "unfinished":
+        return 3 if shift_ended else 0
+    return {"awarded": 1, "finishing": 1, "waiting": 2}.get(state, 3)
 
-    It has as many statuses as one message may contain; of more, those that may still change come first.
 
-    Args:
-        name: Name of the replier.
-        taken: Names of the spaces that each arm may take.
-        trouble: Why the replier accepts and awards no jobs; "" if it does.
-        left_out: As in the reply.
-    """
-    kept, space = list(statuses), {arm: tuple(sorted(names)) for arm, names in sorted(taken.items()) if names}
-    reply = Status(name, time_s, (), space, epoch, dict(paused), trouble, dict(left_out))
-    if len(kept) > MOST_JOBS:
-        kept = sorted(kept, key=lambda status: status.state in SETTLED)[:MOST_JOBS]
-    sizes = accumulate((len(encode(status)) + 1 for status in kept), initial=len(encode(reply)))
+class Position(NamedTuple):
+    """Where the status of a job is in the pages of a reply: it changes only with the state of the job."""
+
+    group: int
+    """As of `urgency`."""
+    order_s: float
+    """Within the group."""
+    job: str
+
+    @property
+    def text(self) -> str:
+        """For `Status.next`."""
+        return f"{self.group} {self.order_s} {self.job}"
+
+    @classmethod
+    def read(cls, text: str) -> Self:
+        """Return the position that has this text; one before all jobs for "".
+
+        Raises:
+            Refused: it is none.
+        """
+        group, _, rest = text.partition(" ")
+        order_s, _, job = rest.partition(" ")
+        try:
+            return cls(int(group), float(order_s), job) if text else cls(-1, 0.0, "")
+        except ValueError:
+            raise Refused(f"StatusRequest.after must be `next` of a reply (got '{printable(text)}').") from None
+
+
+def fitting(reply: Status, statuses: Sequence[JobStatus]) -> tuple[JobStatus, ...]:
+    """Return the first of these statuses, as many as fit into a reply."""
+    sizes = accumulate((len(encode(status)) + 1 for status in statuses), initial=len(encode(reply)))
     next(sizes)
-    return replace(reply, jobs=tuple(status for status, size in zip(kept, sizes, strict=True) if size <= LISTED_BYTES))
+    return tuple(status for status, size in zip(statuses, sizes, strict=True) if size <= LISTED_BYTES)

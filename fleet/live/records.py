@@ -21,7 +21,7 @@ from fleet.bus.protocol.operator import (
     Settle,
     by_whom,
 )
-from fleet.live.job_rules import MAX_OPEN_JOBS, changed_spec, content_hash, hash_of
+from fleet.live.job_rules import MAX_OPEN_JOBS, Position, changed_spec, content_hash, hash_of, urgency
 from fleet.live.journal import (
     ClockTick,
     CommitPermitted,
@@ -202,6 +202,15 @@ class JobEntry(msgspec.Struct):
     def finished_s(self) -> float | None:
         """Fleet time at which it was finished."""
         return self.settled_s if self.state == "finished" else None
+
+    @property
+    def position(self) -> Position:
+        """Where its status is in the pages of a status reply."""
+        if self.state == "waiting":
+            order_s = 0.0 if self.spec is None else self.spec.release_s
+        else:
+            order_s = 0.0 if self.settled_s is None else -self.settled_s
+        return Position(urgency(self.state, shift_ended=self.shift_ended), order_s, self.name)
 
     @property
     def is_settled(self) -> bool:

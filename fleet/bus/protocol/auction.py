@@ -353,18 +353,22 @@ class JobStatus(msgspec.Struct, frozen=True):
 
 
 class StatusRequest(msgspec.Struct, frozen=True):
-    """Request to `jobs/status`: state of these jobs, or of all if none is named. Of more than 128 jobs, those that may
-    still change come first; a reply holds as many as fit into one message."""
+    """Request to `jobs/status`: state of these jobs, or of all if none is named, in pages."""
 
     jobs: tuple[str, ...] = ()
+    after: Annotated[str, msgspec.Meta(max_length=1024)] = ""
+    """`next` of the page before; "" for the first page."""
 
 
 class Status(msgspec.Struct, frozen=True):
-    """Reply to a `StatusRequest`; unknown names are left out."""
+    """Reply to a `StatusRequest`: a page of at most 128 jobs. Unknown names are left out."""
 
     auctioneer: Name
     time_s: Number
     jobs: tuple[JobStatus, ...]
+    """First those that need a person: `unfinished`, unless only because the shift has ended. Then those in work, those
+    that wait, by release, and all others, the newest first. A job that changes its state between two requests may be on
+    two pages, or on none."""
     space: dict[Name, tuple[Name, ...]] = {}
     """Names of the spaces that are closed to other arms, by the arm that takes them or may take them; "*" is its whole
     workspace."""
@@ -376,6 +380,11 @@ class Status(msgspec.Struct, frozen=True):
     """Why its sender accepts and awards no jobs, for example a full disk; "" if it does."""
     left_out: dict[Name, str] = {}
     """Why an arm is awarded no job for a while, by arm: it has not answered the last awards."""
+    counts: dict[JobState, Count] = {}
+    """Number of jobs by state, of all jobs: also those of other pages, and those that the request does not name. Empty
+    if the sender does not count them; `jobs` then has all."""
+    next: str = ""
+    """Send it as `after` to get the next page; "" on the last page."""
 
 
 class Announcement(msgspec.Struct, frozen=True):

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import (
     Ack,
+    JobSpec,
     JobStatus,
     Lease,
     LeaseEntry,
@@ -35,7 +36,7 @@ from fleet.live.epochs import adopted
 from fleet.live.job_rules import finish_s, joined_reasons
 from fleet.live.journal import JobsAccepted, Released
 from fleet.live.leases import Timing, clear, expire, progress, renewal, send_again, unanswered, was_stopped
-from fleet.live.records import MAX_REASON, JobSettled, ShiftEnded, outcome_of, requested_job
+from fleet.live.records import MAX_REASON, JobEntry, JobSettled, ShiftEnded, outcome_of, requested_job
 from fleet.live.space import Excludes, no_conflicts
 from fleet.live.steering import carry_out, controlled
 
@@ -252,17 +253,20 @@ class Auctioneer:
 
     def status(self, names: Iterable[str] = ()) -> tuple[JobStatus, ...]:
         """Return the status of jobs, with the last reported progress."""
+        return self.status_of(self.book.entries(names))
+
+    def status_of(self, entries: Iterable[JobEntry]) -> tuple[JobStatus, ...]:
+        """As `status`, of entries of the book."""
         busy = self.book.busy_stations()
-        return tuple(self._with_progress(status, busy) for status in self.book.status(names))
+        return tuple(self._with_progress(self.book.status_of(entry), entry.spec, busy) for entry in entries)
 
     # Leases
 
-    def _with_progress(self, status: JobStatus, busy: Container[str]) -> JobStatus:
+    def _with_progress(self, status: JobStatus, spec: JobSpec | None, busy: Container[str]) -> JobStatus:
         lease = self.book.leases.get(status.award)
         cycles = status.cycles if lease is None else max(status.cycles, lease.cycles)
         waits = status.state == "waiting"
-        spec = self.book.jobs[status.job].spec if waits else None
-        note = "" if spec is None else self.rounds.reason_to_wait(spec, busy)
+        note = "" if spec is None or not waits else self.rounds.reason_to_wait(spec, busy)
         planned = not waits or bool(status.arm) or self.rounds.is_planned(status.job)  # an arm had it before
         expected_s, reason = finish_s(status, self.rounds.states.get(status.arm)), joined_reasons(status.reason, note)
         return replace(status, cycles=cycles, reason=reason, finish_s=expected_s, not_planned=not planned)

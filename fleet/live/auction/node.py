@@ -4,7 +4,7 @@ import logging
 import math
 import secrets
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 
@@ -42,7 +42,7 @@ from fleet.live.journal import EpochBegun, Journal, Started, TimeRecorder, own_r
 from fleet.live.leases import Timing
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.live.rate_limit import RateLimitedWarnings
-from fleet.live.records import BookRecord, SendAward
+from fleet.live.records import BookRecord, JobEntry, SendAward
 from fleet.live.space import Excludes, no_conflicts
 
 _LOG = logging.getLogger(__name__)
@@ -318,8 +318,11 @@ class AuctionNode(JobDesk):
         self._check_alone("nothing is changed")
         return self.auctioneer.control(request, self.time_s)
 
-    def _statuses(self, names: tuple[str, ...]) -> tuple[JobStatus, ...]:
-        return self.auctioneer.status(names)
+    def _entries(self) -> list[JobEntry]:
+        return self.book.entries()
+
+    def _status_of(self, entries: Sequence[JobEntry]) -> Sequence[JobStatus]:
+        return self.auctioneer.status_of(entries)
 
     def _apply_state(self, arm: str, state: State) -> None:
         # An arm outside the cell may be anywhere: without a token it would stop all others, and nobody could ask it.

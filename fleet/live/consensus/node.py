@@ -9,6 +9,7 @@ import math
 import secrets
 import time
 from collections import deque
+from collections.abc import Sequence
 from random import Random
 
 from msgspec.structs import replace
@@ -30,7 +31,7 @@ from fleet.live.epochs import REPLY_S, adopted, ask_arms, check_journals, histor
 from fleet.live.job_rules import SHIFT_ENDED
 from fleet.live.journal import EpochBegun, Journal, Started, TimeRecorder, own_records
 from fleet.live.rate_limit import RateLimitedWarnings
-from fleet.live.records import BookRecord
+from fleet.live.records import BookRecord, JobEntry
 
 _LOG = logging.getLogger(__name__)
 
@@ -150,7 +151,7 @@ class ConsensusNode(JobDesk):
 
     def statuses(self) -> list[JobStatus]:
         """Return the status of all jobs that this arm knows, those of the stream that are not offered yet included."""
-        return self.participant.status([job for _, job in self._stream], time.monotonic())
+        return self._status_of(self._entries())
 
     # Inside
 
@@ -322,8 +323,11 @@ class ConsensusNode(JobDesk):
         failure = self._recorder.failure
         return f"{self._name} accepts and takes no jobs: {failure}" if failure else ""
 
-    def _statuses(self, names: tuple[str, ...]) -> list[JobStatus]:
-        return [status for status in self.statuses() if not names or status.job in names]
+    def _entries(self) -> list[JobEntry]:
+        return self.participant.entries(job for _, job in self._stream)
+
+    def _status_of(self, entries: Sequence[JobEntry]) -> list[JobStatus]:
+        return self.participant.status_of(entries, time.monotonic())
 
     def _submit(self, submission: Submission) -> SubmissionReply:
         later = {job.name: job for _, job in self._stream}

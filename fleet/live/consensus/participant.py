@@ -39,7 +39,7 @@ from fleet.live.auction.rounds import (
     resolve_claims,
 )
 from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Claimant, Granter
-from fleet.live.job_rules import SHIFT_ENDED, finish_s, job_order, joined_reasons, why_not_ready, with_terms
+from fleet.live.job_rules import SHIFT_ENDED, finish_s, job_order, joined_reasons, why_not_ready
 from fleet.live.leases import Timing, expire
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.live.records import JobEntry, ShiftEnded, requested_job
@@ -200,7 +200,7 @@ class Participant:
                 self.claimant.send_outcome(outcome)
             self.claimant.send_operation(operation)
             self.out.append(operation)
-        return controlled(self.book, request, note, next(iter(self._statuses([job])), None))
+        return controlled(self.book, request, note, next(map(self._status_of, self.book.entries([job])), None))
 
     # Time
 
@@ -255,8 +255,17 @@ class Participant:
         awaited = dict.fromkeys(name for entry in book.waiting.values() if entry.spec for name in entry.spec.after)
         return [name for name in awaited if not (book.is_known(name) or book.is_settled(name))]
 
-    def status(self, later: Iterable[JobSpec], real_s: float) -> list[JobStatus]:
-        """Return the status of all known jobs, and of `later` ones that are not offered yet."""
+    def entries(self, later: Iterable[JobSpec]) -> list[JobEntry]:
+        """Return all known jobs, and `later` ones that are not offered yet."""
+        book, reason = self.book, SHIFT_ENDED if self.book.ended else ""
+        new = [job for job in later if job.name not in book.jobs and job.name not in book.past]
+        state = "unfinished" if book.ended else "waiting"
+        return book.entries() + [
+            JobEntry(job.name, job, state=state, reason=reason, shift_ended=book.ended) for job in new
+        ]
+
+    def status_of(self, entries: Iterable[JobEntry], real_s: float) -> list[JobStatus]:
+        """Return the status of jobs, with why they wait."""
         bids = self._fresh_bids(real_s)
         offered = {offer.job for bid in bids.values() for offer in bid.estimates}
         bidding = self._bidding(bids, offered) if bids else None
@@ -273,22 +282,18 @@ class Participant:
                 return NOT_OFFERED.format(self._slots)
             return reason_to_wait(bidding, job.name)
 
-        new = [job for job in later if job.name not in book.jobs and job.name not in book.past]
-        over = JobStatus("?", "unfinished", reason=SHIFT_ENDED, shift_ended=True)
-        coming = over if book.ended else JobStatus("?", "waiting")
-        statuses = self._statuses() + [with_terms(replace(coming, job=job.name), job) for job in new]
-        specs = {job.name: job for job in new} | {name: entry.spec for name, entry in book.waiting.items()}
-        return [
-            replace(each, reason=joined_reasons(each.reason, why(job)))
-            if each.state == "waiting" and (job := specs.get(each.job)) is not None
-            else each
-            for each in statuses
-        ]
+        statuses: list[JobStatus] = []
+        for entry in entries:
+            status = self._status_of(entry)
+            if status.state == "waiting" and entry.spec is not None:
+                status = replace(status, reason=joined_reasons(status.reason, why(entry.spec)))
+            statuses.append(status)
+        return statuses
 
-    def _statuses(self, names: Iterable[str] = ()) -> list[JobStatus]:
-        """Return the status of these jobs, of all by default, with the expected finish of those in work."""
-        statuses = self.book.status(names)
-        return [replace(each, finish_s=finish_s(each, self.states.get(each.arm))) for each in statuses]
+    def _status_of(self, entry: JobEntry) -> JobStatus:
+        """Return the status of a job, with the expected finish of one in work."""
+        status = self.book.status_of(entry)
+        return replace(status, finish_s=finish_s(status, self.states.get(status.arm)))
 
     def _refusal(self, job: str) -> str:
         """Return why no arm can do a job, or none works; "" if one can, or this arm does not know whether it can."""

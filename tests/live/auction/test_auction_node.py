@@ -19,7 +19,6 @@ from fleet.bus.protocol.auction import (
     ClockRequest,
     JobEstimate,
     JobSpec,
-    JobStatus,
     Lease,
     LeaseEntry,
     LeaseRequest,
@@ -47,7 +46,6 @@ from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.rounds import Assignment
 from fleet.live.book import JobBook
 from fleet.live.epochs import kept_time_s
-from fleet.live.job_rules import status_reply
 from fleet.live.journal import EpochBegun, JobsAccepted, Journal
 from fleet.live.records import BookRecord
 from tests.waiting import PATIENCE_S, serving, wait_until
@@ -310,18 +308,19 @@ def refuse(*_records, **_options):
     raise JournalFull("no room")
 
 
-def test_the_status_of_1500_jobs_fits_into_one_message_with_open_jobs_first(bus):
+def test_the_status_of_1500_jobs_comes_in_pages_with_why_each_waits(bus):
     node = bus.auctioneer()
     long = "x" * 100
     node.submit(Submission(bus.jobs(*(f"{long}{i}" for i in range(1500)))))
-    (status,) = bus.ask(keys.of_jobs("f", "status"), StatusRequest(), Status).messages.values()
-    assert 100 < len(status.jobs) <= 256
-    assert len(encode(status)) < 65_536
-    first = JobStatus("done", "finished")
-    taken = {f"arm_{number}": frozenset("*") for number in range(1000)}
-    reply = status_reply("x", 0.0, (first, *status.jobs * 2), taken)
-    assert (len(reply.jobs) > 0, reply.jobs[0].state, len(reply.space)) == (True, "waiting", 1000)
-    assert len(encode(reply)) < 65_536
+    jobs, after = [], ""
+    for _ in range(1 + 1500 // 128):
+        request = StatusRequest((), after)
+        (status,) = bus.ask(keys.of_jobs("f", "status"), request, Status).messages.values()
+        assert len(encode(status)) < 65_536
+        jobs += status.jobs
+        after = status.next
+    assert (len({job.job for job in jobs}), after, status.counts) == (1500, "", {"waiting": 1500})
+    assert all(job.reason for job in jobs)
 
 
 def test_an_arm_of_an_older_version_is_named_with_its_version(bus):
