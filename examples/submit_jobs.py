@@ -50,8 +50,14 @@ def wait_for_results(session, root, names, seconds):
     subscriber = session.declare_subscriber(f"{root}/auction/*/result", results.put)
     while names - final.keys() and time.monotonic() < end_s:
         # Results before the subscription, and lost ones, are in the status.
+        missing = sorted(names - final.keys())
         statuses = [
-            job for reply in query(session, f"{root}/jobs/status", "StatusRequest", {}) for job in reply["jobs"]
+            job
+            for first in range(0, len(missing), MAX_JOBS)
+            for reply in query(
+                session, f"{root}/jobs/status", "StatusRequest", {"jobs": missing[first : first + MAX_JOBS]}
+            )
+            for job in reply["jobs"]
         ]
         try:
             while True:  # until there is no result for two seconds

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import zenoh
@@ -21,14 +22,13 @@ from fleet.bus.protocol.auction import (
     JobSpec,
     JobStatus,
     Result,
-    Status,
-    StatusRequest,
     Submission,
     SubmissionReply,
 )
 from fleet.bus.protocol.messages import State
 from fleet.errors import JournalError
 from fleet.live.arm.awards import ArmRecord, Closed, JobsFinished
+from fleet.live.job_client import query_statuses
 from fleet.live.journal import Journal
 from fleet.live.supervisor import Supervisor
 
@@ -148,9 +148,7 @@ class Fleet:
 
     def status(self) -> dict[str, JobStatus]:
         """Query the status of all jobs; empty without a reply."""
-        answers = self.client.query_and_wait(
-            keys.of_jobs(self.client.fleet, "status"), StatusRequest(), Status, timeout_s=2.0
-        )
+        answers = self.client.wait(partial(query_statuses, self.client, timeout_s=2.0), 2.0)
         return {job.job: job for word in answers.messages.values() for job in word.jobs}
 
     def submit(self, jobs: Sequence[JobSpec]) -> None:

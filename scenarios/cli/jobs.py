@@ -1,5 +1,6 @@
 """Commands that steer a live fleet: `thermofleet job` and `thermofleet arm pause | reset | clear`."""
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -108,8 +109,9 @@ def list_command(
 
     from fleet.bus.client import BusClient, NoReply
     from fleet.bus.protocol import keys
-    from fleet.bus.protocol.auction import ABANDONED, SETTLED, Status, StatusRequest
+    from fleet.bus.protocol.auction import ABANDONED, SETTLED
     from fleet.bus.security.tls import unknown_certificate_hint
+    from fleet.live.job_client import REPLY_S, query_statuses
     from fleet.live.job_rules import waits_since_s
     from fleet.live.monitor.snapshot import FleetListener
     from scenarios.cli.options import the_fleet
@@ -122,10 +124,12 @@ def list_command(
         known = {job.job: job for job in snapshot.jobs if not names or job.job in names}
         now_s = max((arm.time_s or 0.0 for arm in snapshot.arms), default=0.0)
         try:  # results tell neither predicted ends nor why jobs wait
-            asked = StatusRequest(tuple(names or ()))
-            now = link.ask(keys.of_jobs(link.fleet, "status"), asked, Status, timeout_s=LISTEN_S)
+            query = partial(query_statuses, link, names=names or (), timeout_s=REPLY_S)
+            now = link.wait(query, REPLY_S).first(keys.of_jobs(link.fleet, "status"))
             known |= {job.job: job for job in now.jobs}
             now_s = max(now_s, now.time_s)
+            if now.next:
+                say(f"Only {len(now.jobs)} of {sum(now.counts.values())} jobs arrived in time.", err_console)
         except (NoReply, Refused) as error:
             if not known:
                 hint = unknown_certificate_hint(endpoint) if isinstance(error, NoReply) else ""

@@ -44,7 +44,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import JobSpec, QuoteRequest, Status, StatusRequest, Submission, SubmissionReply
+from fleet.bus.protocol.auction import JobSpec, QuoteRequest, Submission, SubmissionReply
 from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.messages import MalformedMessage, decode, encode
 from fleet.bus.protocol.operator import (
@@ -397,8 +397,8 @@ def application(
     clear = of_jobs("clear", ClearRequest, Cleared)
 
     async def get_jobs(request: Request) -> Response:
-        names = tuple(request.query_params.getlist("job"))
-        return json_response(await ask(keys.of_jobs(bridge.fleet, "status"), StatusRequest(names), Status))
+        names = request.query_params.getlist("job")
+        return json_response(await limited(lambda: bridge.statuses(names)))
 
     async def post_reset(request: Request) -> Response:
         body = await read_body(request, ResetBody)

@@ -48,6 +48,7 @@ from scenarios.prepare.fleet import make_env, prepare, prepare_arm
 from scenarios.spec.load import load
 from scenarios.spec.schema import Ambient
 from tests import commands
+from tests.live.many_jobs import ManyJobs, entries
 from tests.waiting import PATIENCE_S, serve_until, serving
 from twin.logs.recording import READINGS
 
@@ -527,6 +528,18 @@ def test_a_list_of_jobs_has_a_line_for_each_and_ages_since_their_acceptance(endp
     assert sentence == f"new: state waiting, cycles 0 of 12, age 2 min, due 0:50:00, 10 min late, reason {why}"
     assert [line.split()[:2] for line in narrow] == [["new", "waiting"], ["planned", "waiting"]]
     assert all(len(line) <= 80 and "It waits until the_arm" in line for line in narrow)
+
+
+def test_a_list_of_jobs_has_all_with_their_reasons(endpoint, thermofleet, monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    desk = ManyJobs(*entries(481, "waiting", reason="Its place is in use."), *entries(300), *entries(1, "unfinished"))
+    listed = ("job", "list", "--endpoint", endpoint, "--fleet", "f")
+    with served(endpoint, desk.reply_on):
+        _, *lines = thermofleet(*listed)[1].splitlines()
+        named = thermofleet(*listed, *[*desk.entries][:300], "--json")[1]
+    assert sorted(line.split()[0] for line in lines) == sorted(desk.entries)
+    assert sum("Its place is in use." in line for line in lines) == 481
+    assert [job["job"] for job in json.loads(named)] == sorted([*desk.entries][:300])
 
 
 def test_a_list_of_jobs_needs_somebody_who_tells(endpoint, thermofleet):

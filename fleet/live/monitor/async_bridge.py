@@ -21,10 +21,11 @@ import msgspec
 
 from fleet.bus.client import BusClient, Replies, replier
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import Quote, QuoteRequest
+from fleet.bus.protocol.auction import Quote, QuoteRequest, Status
 from fleet.bus.protocol.messages import encode
 from fleet.bus.protocol.operator import Alarm
 from fleet.errors import BusError, Refused
+from fleet.live.job_client import query_statuses
 from fleet.live.monitor.alarms import AlarmList
 from fleet.live.monitor.health import Finding, check_connection, check_fleet, complaints_of_states
 from fleet.live.monitor.snapshot import FRESH_S, MAX_JOBS, FleetListener, FleetSnapshot, Recent, Role
@@ -172,11 +173,12 @@ class AsyncBridge:
             NoReply: no reply.
             BusError: the certificate does not permit the query.
         """
-        replies = await self._query(key, request, kind, REPLY_S)
-        try:
-            return replies.first(key)
-        except Refused as error:
-            raise type(error)(f"The {replier(key)} refused: {error}") from error
+        return first_reply(await self._query(key, request, kind, REPLY_S), key)
+
+    async def statuses(self, names: Sequence[str]) -> Status:
+        """Query the status of these jobs, of all if none is named; raises as `ask`."""
+        query = partial(query_statuses, self._link, names=names, timeout_s=REPLY_S)
+        return first_reply(await self._replies(query), keys.of_jobs(self.fleet, "status"))
 
     async def acknowledge(self, alarm: str, by: str) -> Alarm:
         """Note that a person has seen an alarm. Raises Refused as `AlarmList.acknowledge`."""
@@ -202,15 +204,20 @@ class AsyncBridge:
         return Quotes(tuple(answers.messages.values()), tuple(answers.refused.values()))
 
     async def _query(self, key: str, request: msgspec.Struct, kind: type[Reply], timeout_s: float) -> Replies[Reply]:
-        def query(done: Callable[[Replies[Reply] | BusError], None]) -> None:
+        return await self._replies(partial(self._link.query, key, request, kind, timeout_s=timeout_s))
+
+    async def _replies(self, query: Callable[[Callable[[Replies[Reply]], None]], None]) -> Replies[Reply]:
+        """Begin a query with the handler of its replies; return them."""
+
+        def begin(done: Callable[[Replies[Reply] | BusError], None]) -> None:
             try:
                 if not self._link.connected:
                     raise BusError("The connection to the router is lost: it has ended, or is unreachable.")
-                self._link.query(key, request, kind, done, timeout_s=timeout_s)
+                query(done)
             except BusError as error:
                 done(error)
 
-        answers = await self._on_bus(query)
+        answers = await self._on_bus(begin)
         if isinstance(answers, BusError):
             raise answers
         return answers
@@ -281,6 +288,14 @@ class AsyncBridge:
             self._loop.call_soon_threadsafe(call)
         except RuntimeError:
             _LOG.debug("The event loop has ended.")
+
+
+def first_reply(replies: Replies[Reply], key: str) -> Reply:
+    """As `Replies.first`; a refusal names who refuses."""
+    try:
+        return replies.first(key)
+    except Refused as error:
+        raise type(error)(f"The {replier(key)} refused: {error}") from error
 
 
 def fleet_time_s(fleet: FleetSnapshot) -> float:
