@@ -13,7 +13,7 @@ from fleet.live.monitor.snapshot import FleetSnapshot
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 METRICS: Mapping[str, tuple[str, str]] = {
-    "jobs": ("gauge", "Jobs by state, of those that the gateway keeps."),
+    "jobs": ("gauge", "Jobs by state."),
     "job_changes_total": (
         "counter",
         "Changes of jobs to a state, as an auctioneer publishes them, cached ones included.",

@@ -29,13 +29,14 @@ from fleet.bus.protocol.auction import (
     JobStatus,
     Result,
     Status,
-    StatusRequest,
 )
 from fleet.bus.protocol.keys import PUBLISHED
-from fleet.bus.protocol.messages import DifficultyScores, Info, State, encode
+from fleet.bus.protocol.messages import DifficultyScores, Info, State
 from fleet.bus.protocol.operator import ALL_ARMS, Alarm, ControlRequest, Operation, Pause, Resume, by_whom
 from fleet.errors import BusError
 from fleet.events import EVENT_KINDS
+from fleet.live.job_client import query_statuses
+from fleet.live.job_rules import urgency
 from fleet.live.sensors import ArmSensors
 from fleet.telemetry import Mode
 
@@ -51,8 +52,6 @@ MOST_STARTS, STARTS_S = 2, 5.0
 MAX_NAMES, MAX_JOBS, MAX_ALARMS = 1024, 4096, 256
 ENDED: tuple[auction.JobState, ...] = ("finished", *auction.ABANDONED)
 """States of jobs that need nobody any more."""
-COMPLETE_BYTES = 32_000
-"""A status reply that is smaller, and has fewer jobs than one message may have, names all jobs."""
 
 STATUS_EVERY_S = 5.0
 """Real seconds between two requests of the clock and of all jobs, whose results may be older than the listener."""
@@ -167,9 +166,9 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
     arms: tuple[ArmSnapshot, ...]
     auctioneers: tuple[AuctioneerSnapshot, ...]
     counts: dict[str, int]
-    """Number of jobs by state, of the `MAX_JOBS` that are kept: of more, those that have ended are dropped first."""
+    """Number of all jobs by state."""
     jobs: tuple[JobStatus, ...]
-    """The most recently changed last."""
+    """At most `MAX_JOBS`, the most recently changed last. Of more, those that have ended are dropped first."""
     space: dict[str, tuple[str, ...]] = {}
     """Names of the spaces that are closed to other arms, by arm, from the last status reply."""
     paused: dict[str, str] = {}
@@ -285,6 +284,8 @@ class FleetView:
     _jobs: "Recent[str, _Job]" = field(
         default_factory=lambda: Recent(MAX_JOBS, lambda job: job.status.state not in ENDED)
     )
+    _others: Counter[str] = field(default_factory=Counter[str])
+    """Number of jobs by state, of those that are not kept."""
     _changes: Counter[str] = field(default_factory=Counter[str])
     alarms: "Recent[str, Alarm]" = field(default_factory=lambda: Recent(MAX_ALARMS, lambda one: one.ended_s is None))
     """The last message of each alarm, by name."""
@@ -333,29 +334,38 @@ class FleetView:
         """Apply the auctioneer's reply to a status request."""
         auctioneer = self._auctioneer(reply.auctioneer)
         if reply.time_s < auctioneer.time_s:  # another fleet, or one that was restarted with new result numbers
-            if not _complete(reply):
+            if not _has_all(reply):
                 self._jobs.clear()
             for job in self._jobs.values():
                 job.number = 0
         auctioneer.heard_s, auctioneer.time_s, auctioneer.trouble = now_s, reply.time_s, reply.trouble
         self._space, self._paused, self._left_out = dict(reply.space), dict(reply.paused), dict(reply.left_out)
-        for status in reply.jobs:
+        for status in reversed(reply.jobs):  # so that those that need a person count as the most recent ones
             self._set_status(status, now_s)
 
     def forget_other_jobs(self, replies: Sequence[Status], asked_s: float) -> None:
-        """Evict jobs of an earlier fleet: in no reply to a request for all jobs, and in no message since `asked_s`.
+        """Evict jobs that are in no reply to a request for all jobs, and in no message since `asked_s`.
 
-        A reply that may have been too small for all jobs changes nothing.
+        They are of an earlier fleet, or follow the first `MAX_JOBS` and are only counted. A reply that should have more
+        jobs changes nothing.
         """
-        if not replies or not all(map(_complete, replies)):
+        if not replies or not all(_has_all(reply) or len(reply.jobs) >= MAX_JOBS for reply in replies):
             return
         named = {status.job for reply in replies for status in reply.jobs}
         for name, job in list(self._jobs.items()):
             if name not in named and job.heard_s < asked_s:
                 del self._jobs[name]
+        self._others.clear()
+        if following := next((reply for reply in replies if reply.next), None):
+            self._others = Counter[str](following.counts) - self._count()
+
+    def _count(self) -> Counter[str]:
+        """Number of kept jobs by state."""
+        return Counter(job.status.state for job in self._jobs.values())
 
     def snapshot(self, now_s: float, jobs: int = MAX_JOBS) -> FleetSnapshot:
-        """The fleet at the real second `now_s`, with at most `jobs` of the jobs that changed last."""
+        """The fleet at the real second `now_s`, with at most `jobs` jobs: those that need a person, are in work, or
+        wait, before those that have ended, and then those that changed last."""
         statuses = [job.status for job in self._jobs.values()]
         ended = {status.job for status in statuses if status.state in ("finished", "unfinished")}
         waiting = {status.job: status.reason for status in statuses if status.state == "waiting"}
@@ -367,9 +377,9 @@ class FleetView:
                 AuctioneerSnapshot(name, each.token, _age_s(each.heard_s, now_s), each.trouble)
                 for name, each in sorted(self._auctioneers.items())
             ),
-            counts=dict(Counter(status.state for status in statuses)),
+            counts=dict(self._count() + self._others),
             changes=dict(self._changes),
-            jobs=tuple(statuses[-jobs:]) if jobs > 0 else (),
+            jobs=_most_urgent(statuses, jobs),
             space=self._space,
             paused=dict(self._paused),
             left_out=dict(self._left_out),
@@ -450,7 +460,7 @@ class FleetListener:
             fleet, done = self._link.fleet, partial(self._statuses, asked_s)
             try:
                 self._link.query(keys.of_clock(fleet), ClockRequest(), Clock, self._clocks, timeout_s=STATUS_EVERY_S)
-                self._link.query(keys.of_jobs(fleet, "status"), StatusRequest(), Status, done, timeout_s=STATUS_EVERY_S)
+                query_statuses(self._link, done, timeout_s=STATUS_EVERY_S, most=MAX_JOBS)
             except BusError as error:
                 _LOG.warning("%s", error)
         while time.monotonic() < until_s:
@@ -552,9 +562,20 @@ def _age_s(at_s: float | None, now_s: float) -> float | None:
     return None if at_s is None else now_s - at_s
 
 
-def _complete(reply: Status) -> bool:
-    """Whether a status reply had room for every job."""
-    return len(reply.jobs) < auction.MOST_JOBS and len(encode(reply)) < COMPLETE_BYTES
+def _has_all(reply: Status) -> bool:
+    """Whether a status reply names all jobs; one of a sender that counts none may have had no room for more."""
+    return not reply.next and (bool(reply.counts) or len(reply.jobs) < auction.MOST_JOBS)
+
+
+def _most_urgent(statuses: Sequence[JobStatus], most: int) -> tuple[JobStatus, ...]:
+    """Return at most `most` statuses in their order: by their urgency, and of the last group the last ones."""
+
+    def order(i: int) -> tuple[int, int]:
+        return urgency(statuses[i].state, shift_ended=statuses[i].shift_ended), -i
+
+    if len(statuses) <= most:
+        return tuple(statuses)
+    return tuple(statuses[i] for i in sorted(sorted(range(len(statuses)), key=order)[:most]))
 
 
 def _arm_snapshot(name: str, arm: _Arm, now_s: float, speed: float | None, ended: Container[str]) -> ArmSnapshot:

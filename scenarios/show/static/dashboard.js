@@ -365,8 +365,9 @@ function startPage() {
     const listed = [...fleet.jobs.values()], rank = { unfinished: 0, finishing: 1, awarded: 2, waiting: 3 };
     const open = listed.filter(({ state }) => state in rank).sort((a, b) => rank[a.state] - rank[b.state]);
     jobs.update(open.slice(0, MOST_ROWS).map((status) => [status.job, status]), fillJob);
-    const counts = Object.entries(fleet.counts).map(([state, count]) => `${count} ${state.replace("_", " ")}`).join(", ");
-    setText(element("counts"), `${counts || "No jobs"}.${open.length > MOST_ROWS ? ` The first ${MOST_ROWS} of ${open.length} open jobs are listed.` : ""}`);
+    const counts = Object.entries(fleet.counts), openCount = counts.reduce((sum, [state, count]) => sum + (state in rank ? count : 0), 0);
+    const counted = counts.map(([state, count]) => `${count} ${state.replace("_", " ")}`).join(", ");
+    setText(element("counts"), `${counted || "No jobs"}.${openCount > MOST_ROWS ? ` The first ${MOST_ROWS} of ${openCount} open jobs are listed.` : ""}`);
     if (element("settled-part").open) settled.update(listed.filter(({ state }) => !(state in rank)).reverse().slice(0, MOST_ROWS).map((status) => [status.job, status]), fillSettled);
     const waiting = open.filter(({ job, state }) => state === "waiting" && (offers.get(job) || new Map()).size).slice(0, MOST_AWARDS);
     offered.update([

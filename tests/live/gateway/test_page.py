@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from fleet.bus.client import BusClient
 from fleet.bus.protocol.auction import Admission, Status, SubmissionReply
 from fleet.bus.protocol.operator import ControlRequest, Operation, Pause, ResetRequest, Resume
 from fleet.bus.router import Router
@@ -27,7 +28,8 @@ from scenarios.spec.load import load
 from tests import commands
 from tests.live.gateway.moving_fleet import MovingFleet
 from tests.live.gateway.served import Served, events, numbers_of, of
-from tests.waiting import PATIENCE_S, wait_until
+from tests.live.many_jobs import ManyJobs, entries
+from tests.waiting import PATIENCE_S, serving, wait_until
 
 BROWSER = {"Accept": "text/html,application/xhtml+xml,application/xml;q=0.9,*/*;q=0.8"}
 CRATE_JSON = {"name": "crate 1", "kind": "hold", "places": ["rack"]}
@@ -209,6 +211,21 @@ def test_jobs_are_submitted_and_quoted(gateway, arm):
     assert (status, told["jobs"][0]["state"]) == (200, "waiting")
     status, _, told = gateway.ask("POST", "/v4/ask", {"jobs": [CRATE_JSON]})
     assert (status, told["quotes"][0]["estimates"][0]["plans"][0]["difficulty"]) == (200, 0.2)
+
+
+def test_all_jobs_of_a_large_fleet_are_told_and_counted():
+    """Without an auctioneer, so without results."""
+    desk = ManyJobs(*entries(481, "waiting", reason="Its place is in use."), *entries(300), *entries(1, "unfinished"))
+    counts = {"waiting": 481, "finished": 300, "unfinished": 1}
+    with Router() as router, BusClient(router.endpoint, "f") as link, Served(router.endpoint) as gateway:
+        desk.reply_on(link)
+        with serving(link):
+            wait_until(lambda: gateway.ask("GET", "/v4/fleet?jobs=0")[2]["counts"] == counts)
+            status, _, told = gateway.ask("GET", "/v4/jobs")
+            assert {job["job"] for job in gateway.ask("GET", "/v4/fleet?jobs=5")[2]["jobs"]} >= {"unfinished_0000"}
+            wait_until(lambda: [alarm["kind"] for alarm in gateway.ask("GET", "/v4/alarms")[2]] == ["unfinished"])
+    assert (status, told["counts"], told["next"]) == (200, counts, "")
+    assert sorted(job["job"] for job in told["jobs"]) == sorted(desk.entries)
 
 
 @pytest.mark.parametrize(

@@ -9,15 +9,17 @@ from hypothesis import strategies as st
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import ArmEvent, JobStatus, Status, StatusRequest
+from fleet.bus.protocol.auction import ArmEvent, JobState, JobStatus, Status, StatusRequest
 from fleet.bus.protocol.messages import DifficultyScores
 from fleet.bus.router import Router
 from fleet.live.monitor import snapshot as listener_module
 from fleet.live.monitor import snapshot as snapshot_module
 from fleet.live.monitor.async_bridge import HISTORY, NEWEST_ONLY, EventFeed
+from fleet.live.monitor.health import check_jobs
 from fleet.live.monitor.snapshot import FRESH_S, FleetListener, FleetView, JobScore
+from tests.live.many_jobs import ManyJobs, entries
 from tests.live.monitor.messages import result, stands, state
-from tests.waiting import serve_until, wait_until
+from tests.waiting import serve_until, serving, wait_until
 
 
 @given(token=st.booleans(), age_s=st.floats(0.0, 10.0), spoke=st.booleans())
@@ -91,17 +93,45 @@ def test_a_restarted_fleet_counts_its_results_anew():
     assert seen.snapshot(3.0).counts == {"awarded": 1}
 
 
-@pytest.mark.parametrize(("jobs", "letters"), [(128, 1), (20, 2000)])
-def test_an_incomplete_status_reply_drops_no_job(jobs, letters):
-    names = [f"{number:03d}{'x' * letters}" for number in range(jobs)]
+@pytest.mark.parametrize("change", [{"next": "3 1.0 x"}, {"counts": {}}], ids=["more follow", "jobs are not counted"])
+def test_an_incomplete_status_reply_drops_no_job(change):
+    names = [f"{number:03d}" for number in range(128)]
     seen = FleetView("f")
     seen.update("au", result(0, "old", "finished"), 0.0)
-    full = stands(5.0, *names)
+    full = msgspec.structs.replace(stands(5.0, *names), **{"counts": {"finished": 129}, **change})
     seen.update_jobs(full, 2.0)
     seen.forget_other_jobs([full], 1.0)
-    assert sum(seen.snapshot(2.0).counts.values()) == jobs + 1
-    seen.update_jobs(stands(1.0, *names), 3.0)  # but time that ran back does
-    assert sum(seen.snapshot(3.0).counts.values()) == jobs
+    assert sum(seen.snapshot(2.0).counts.values()) == 129
+    seen.update_jobs(msgspec.structs.replace(full, time_s=1.0), 3.0)  # but time that ran back does
+    assert sum(seen.snapshot(3.0).counts.values()) == 128
+
+
+def test_jobs_beyond_those_that_are_kept_are_counted(monkeypatch):
+    """By hand: of 9 jobs 4 are kept; the job in work of an earlier reply is one of the others now."""
+    monkeypatch.setattr(snapshot_module, "MAX_JOBS", 4)
+    seen = FleetView("f")
+    before = Status("au", 1.0, (JobStatus("stale", "finishing"),), counts={"finishing": 1})
+    seen.update_jobs(before, 0.0)
+    waiting = tuple(JobStatus(f"w{n}", "waiting") for n in range(3))
+    counts: dict[JobState, int] = {"unfinished": 1, "waiting": 5, "finished": 3}
+    reply = Status("au", 5.0, (JobStatus("u", "unfinished"), *waiting), counts=counts, next="2 0.0 w2")
+    seen.update_jobs(reply, 5.0)
+    seen.forget_other_jobs([reply], 4.0)
+    now = seen.snapshot(5.0)
+    assert now.counts == counts
+    assert [status.job for status in now.jobs] == ["w2", "w1", "w0", "u"]
+    whole = Status("au", 6.0, reply.jobs, counts={"unfinished": 1, "waiting": 3})
+    seen.update_jobs(whole, 6.0)
+    seen.forget_other_jobs([whole], 5.5)
+    assert seen.snapshot(6.0).counts == {"unfinished": 1, "waiting": 3}
+
+
+def test_a_short_list_has_the_jobs_that_need_somebody_though_others_changed_later():
+    seen = FleetView("f")
+    for number, to in enumerate(("unfinished", "waiting", "finishing", "given_up", "finished", "finished")):
+        seen.update("au", result(number, f"j{number}", to), 0.0)
+    shown = [[status.job for status in seen.snapshot(0.0, jobs).jobs] for jobs in (0, 1, 2, 4, 9)]
+    assert shown == [[], ["j0"], ["j0", "j2"], ["j0", "j1", "j2", "j5"], [f"j{number}" for number in range(6)]]
 
 
 def test_an_older_result_changes_nothing_and_a_status_adds_jobs_without_one():
@@ -203,6 +233,30 @@ def test_a_listener_counts_only_the_jobs_of_the_present_fleet(monkeypatch):
         for fleet in ({"finished": 2}, {"waiting": 1}):
             serve_until(lambda fleet=fleet: seen.view.snapshot(0.0).counts == fleet, seen, auctioneer)
             del fleets[:-1]
+
+
+def test_a_listener_finds_an_unfinished_job_among_300_finished_ones_without_results(monkeypatch):
+    monkeypatch.setattr(listener_module, "STATUS_EVERY_S", 0.5)
+    desk = ManyJobs(*entries(300), *entries(1, "finishing"))
+    with Router() as router, BusClient(router.endpoint, "f") as link, BusClient(router.endpoint, "f") as arm:
+        desk.reply_on(arm)
+        seen = FleetListener(link)
+        with serving(arm):
+            serve_until(lambda: seen.view.snapshot(0.0).counts == {"finished": 300, "finishing": 1}, seen)
+            assert not check_jobs(seen.view.snapshot(0.0))
+            desk.move("finishing_0000", "unfinished", reason="arm_1 is silent")
+            serve_until(lambda: seen.view.snapshot(0.0).counts == {"finished": 300, "unfinished": 1}, seen)
+        (finding,) = check_jobs(seen.view.snapshot(0.0))
+    assert (finding.kind, finding.subject) == ("unfinished", "finishing_0000")
+
+
+def test_a_listener_knows_why_each_of_481_jobs_waits(monkeypatch):
+    desk = ManyJobs(*entries(481, "waiting", reason="Its place is in use."))
+    with Router() as router, BusClient(router.endpoint, "f") as link, BusClient(router.endpoint, "f") as arm:
+        desk.reply_on(arm)
+        seen = FleetListener(link)
+        serve_until(lambda: sum(seen.view.snapshot(0.0).counts.values()) == 481, seen, arm)
+        assert all(status.reason for status in seen.view.snapshot(0.0).jobs)
 
 
 def test_a_listener_receives_a_whole_fleet(fleet):
