@@ -16,7 +16,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Clock, ClockRequest, JobStatus
 from fleet.bus.protocol.messages import State
 from fleet.bus.router import Router
-from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_fleet, check_health
+from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_fleet, check_health, check_progress
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, AuctioneerSnapshot, FleetSnapshot
 from scenarios.show.watch import space_line
 from tests import commands
@@ -94,6 +94,24 @@ def test_jobs_that_wait_in_vain_are_a_fault(reason, level, counts, before, says)
     now = msgspec.structs.replace(fleet(arm(), counts={"waiting": 2, **counts}), jobs=jobs)
     found = check_health(now, 101.505, [ASKED], earlier=msgspec.structs.replace(now, jobs=jobs[:before])).findings
     assert [(finding.level, finding.what[: len(says or "")]) for finding in found] == ([(level, says)] if says else [])
+
+
+@pytest.mark.parametrize(
+    ("change", "in_vain"),
+    [
+        ({"mode": "working"}, False),
+        ({"mode": "working", "present": False}, True),
+        ({"mode": "faulted", "away": True}, True),
+    ],
+    ids=["on its way home", "gone", "faulted"],
+)
+def test_jobs_do_not_wait_in_vain_while_an_arm_moves_without_one(change, in_vain):
+    jobs = (JobStatus("j", "waiting", reason="b has a job."),)
+    now = msgspec.structs.replace(fleet(arm(), arm(arm="b", **change), counts={"waiting": 1}), jobs=jobs)
+    for before, after in ((now, now), (now, fleet(arm())), (fleet(arm()), now)):
+        both = [msgspec.structs.replace(each, jobs=jobs) for each in (before, after)]
+        waits = [each.kind for each in check_progress(both[1], both[0])] == ["no_progress"]
+        assert waits == in_vain
 
 
 def test_space_of_an_arm_that_has_gone_is_a_fault_if_jobs_wait_for_it():

@@ -261,7 +261,7 @@ def check_jobs(fleet: FleetSnapshot) -> list[Finding]:
 
 def check_progress(fleet: FleetSnapshot, earlier: FleetSnapshot | None) -> list[Finding]:
     """Check that no job waits while arms are idle and none works, by the reasons that the fleet gives."""
-    if earlier is None or _at_work(fleet) or _at_work(earlier):
+    if earlier is None or _is_at_work(fleet) or _is_at_work(earlier):
         return []
     before = {status.job for status in earlier.jobs if status.state == "waiting"}
     waiting = [status for status in fleet.jobs if status.state == "waiting" and status.job in before]
@@ -290,9 +290,10 @@ def _in_the_way(reason: str) -> list[str]:
     return rest.partition(" is out of the way")[0].split(", ")
 
 
-def _at_work(fleet: FleetSnapshot) -> int:
-    """Number of jobs that arms have."""
-    return fleet.counts.get("awarded", 0) + fleet.counts.get("finishing", 0)
+def _is_at_work(fleet: FleetSnapshot) -> bool:
+    """Whether an arm has a job, or moves: it may be on its way home after one."""
+    awarded = fleet.counts.get("awarded", 0) + fleet.counts.get("finishing", 0)
+    return awarded > 0 or any(arm.present and arm.mode == "working" for arm in fleet.arms)
 
 
 def check_space(fleet: FleetSnapshot) -> list[Finding]:
