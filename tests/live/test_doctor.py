@@ -15,6 +15,7 @@ from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Clock, ClockRequest, JobStatus
 from fleet.bus.protocol.messages import State
+from fleet.bus.protocol.operator import Alarm
 from fleet.bus.router import Router
 from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_fleet, check_health, check_progress
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, AuctioneerSnapshot, FleetSnapshot
@@ -271,6 +272,19 @@ def test_a_warning_is_no_fault():
     assert "'z'" not in warned
     assert [each.what for each in found.findings if each.level == "note"] == [
         "b is in a break until 0:15:00 of fleet time."
+    ]
+
+
+def test_an_abandoned_job_is_a_warning_until_somebody_has_acknowledged_its_alarm():
+    jobs = tuple(JobStatus(name, "given_up", reason="It expired.") for name in "xy")
+    begun = [Alarm("m", number, 5.0, f"alarm {name}", "given_up", "…", name) for number, name in enumerate("xy")]
+    seen = msgspec.structs.replace(begun[0], by="ann", ended_s=6.0)
+    other = msgspec.structs.replace(seen, kind="unfinished", subject="y")
+    now = msgspec.structs.replace(fleet(arm()), jobs=jobs, alarms=(seen, begun[1], other))
+    _, found = faults(now)
+    assert [(each.level, each.what) for each in found.findings] == [
+        ("note", "'x' is abandoned, as ann has acknowledged: It expired."),
+        ("warning", "'y' is abandoned: It expired."),
     ]
 
 

@@ -247,15 +247,21 @@ def check_awards(fleet: FleetSnapshot) -> list[Finding]:
 
 
 def check_jobs(fleet: FleetSnapshot) -> list[Finding]:
-    """Check that no job is unfinished or abandoned, except by the end of the shift."""
+    """Check that no job is unfinished or abandoned, except by the end of the shift.
+
+    An abandoned job whose alarm somebody has acknowledged is only noted.
+    """
     findings: list[Finding] = []
+    seen_by = {alarm.subject: alarm.by for alarm in fleet.alarms if alarm.kind == "given_up" and alarm.by}
     for job in fleet.jobs:
         why = job.reason or "no reason"
         if job.state == "unfinished" and not job.shift_ended:  # a person must look at the cell
             what = f"'{job.job}' is unfinished, so its outcome is unknown: {why}"
             findings.append(Finding("fault", what, "unfinished", job.job))
         elif job.state == "given_up" and not job.shift_ended:
-            findings.append(Finding("warning", f"'{job.job}' is abandoned: {why}", "given_up", job.job))
+            by = seen_by.get(job.job, "")
+            what = f"'{job.job}' is abandoned{f', as {by} has acknowledged' if by else ''}: {why}"
+            findings.append(Finding("note" if by else "warning", what, "given_up", job.job))
     return findings
 
 
