@@ -122,13 +122,20 @@ def check_coordinates(value: object, *fields: str) -> None:
             )
 
 
+MOST_LISTED, NEAREST = 60, 5
+"""Values that an error message lists at most; of more names, as many as are most similar."""
+
+
 def listed(values: Iterable[object]) -> str:
-    """Values in an error message, with commas between them; "none" if there are none."""
-    return ", ".join(map(str, values)) or "none"
+    """Values in an error message, with commas between them, the first ones of very many; "none" if there are none."""
+    texts = list(map(str, values))
+    if len(texts) > MOST_LISTED:
+        texts[MOST_LISTED:] = [f"and {len(texts) - MOST_LISTED} more"]
+    return ", ".join(texts) or "none"
 
 
 def nearest(name: str, allowed: Iterable[str]) -> str:
-    """End of an error message: the allowed names, and the most similar one if there is one.
+    """End of an error message: the allowed names, or the most similar ones of very many, and which one was meant.
 
     Returns:
         For example `; did you mean 'ambient_c'? Allowed: ambient_c, arms.`
@@ -136,6 +143,9 @@ def nearest(name: str, allowed: Iterable[str]) -> str:
     names = sorted(set(allowed))
     close = get_close_matches(name, names, n=1)
     hint = f"; did you mean '{close[0]}'?" if close else "."
+    if len(names) > MOST_LISTED:
+        similar = get_close_matches(name, names, n=NEAREST, cutoff=0.0)
+        return f"{hint} The most similar of {len(names)}: {listed(similar)}."
     return f"{hint} Allowed: {listed(names)}."
 
 

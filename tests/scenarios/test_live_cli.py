@@ -537,9 +537,13 @@ def test_a_list_of_jobs_has_all_with_their_reasons(endpoint, thermofleet, monkey
     with served(endpoint, desk.reply_on):
         _, *lines = thermofleet(*listed)[1].splitlines()
         named = thermofleet(*listed, *[*desk.entries][:300], "--json")[1]
+        unknown = thermofleet(*listed, "unfinished")[2]
     assert sorted(line.split()[0] for line in lines) == sorted(desk.entries)
     assert sum("Its place is in use." in line for line in lines) == 481
     assert [job["job"] for job in json.loads(named)] == sorted([*desk.entries][:300])
+    near = " ".join(unknown.split()).partition("knows no job 'unfinished'")[2]
+    assert near.startswith("; did you mean 'unfinished_0000'? The most similar of 782: unfinished_0000, finished_0")
+    assert near.count("finished_") == 6
 
 
 def test_a_list_of_jobs_needs_somebody_who_tells(endpoint, thermofleet):
