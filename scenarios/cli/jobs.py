@@ -129,7 +129,8 @@ def list_command(
             known |= {job.job: job for job in now.jobs}
             now_s = max(now_s, now.time_s)
             if now.next:
-                say(f"Only {len(now.jobs)} of {sum(now.counts.values())} jobs arrived in time.", err_console)
+                wanted = len(names or ()) or sum(now.counts.values())
+                say(f"Only {len(now.jobs)} of {wanted} jobs arrived in time.", err_console)
         except (NoReply, Refused) as error:
             if not known:
                 hint = unknown_certificate_hint(endpoint) if isinstance(error, NoReply) else ""

@@ -2,12 +2,13 @@
 
 from collections import Counter
 from functools import partial
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks.simulation.participants import CLIENT
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import MOST_JOBS, JobSpec, JobState, Status, StatusRequest
@@ -104,8 +105,23 @@ def test_a_position_that_no_reply_has_is_refused(after):
         ManyJobs(*entries(1)).reply(StatusRequest((), after))
 
 
+def test_every_kind_of_fleet_tells_the_state_of_all_jobs_and_why_they_wait(fleet):
+    """With an auctioneer, and without one."""
+    jobs = [JobSpec(f"j{number}", "hold", ("a",), release_s=1e6 * (number % 2)) for number in range(300)]
+    for first in range(0, 300, MOST_JOBS):
+        fleet.submit(*jobs[first : first + MOST_JOBS])
+    replies: list[Any] = []
+    client = fleet.world.processes[CLIENT].client
+    fleet.call(CLIENT, lambda: query_statuses(client, replies.append, timeout_s=5.0))
+    fleet.until(lambda: bool(replies))
+    status = replies[0].first(STATUS)
+    assert {each.job for each in status.jobs} == {job.name for job in jobs}
+    assert (status.next, sum(status.counts.values())) == ("", 300)
+    assert sum(each.state == "waiting" and bool(each.reason) for each in status.jobs) == status.counts["waiting"]
+
+
 @pytest.fixture
-def fleet():
+def many():
     """A client, and a participant with 400 jobs that it serves on a thread."""
     with Router() as router, BusClient(router.endpoint, "f") as link, BusClient(router.endpoint, "f") as other:
         desk = ManyJobs(*entries(399), *entries(1, "unfinished"))
@@ -119,16 +135,16 @@ def read_all(link, names=(), **options):
     return link.wait(query, PATIENCE_S).first(STATUS)
 
 
-def test_a_client_reads_all_pages_as_one_reply(fleet):
-    link, desk = fleet
+def test_a_client_reads_all_pages_as_one_reply(many):
+    link, desk = many
     status = read_all(link)
     assert (len(status.jobs), status.next, status.jobs[0].state) == (400, "", "unfinished")
     assert status.counts == {"finished": 399, "unfinished": 1}
     assert len(read_all(link, [*desk.entries][:300]).jobs) == 300
 
 
-def test_a_client_stops_after_enough_jobs_or_pages(fleet, monkeypatch):
-    link, _ = fleet
+def test_a_client_stops_after_enough_jobs_or_pages(many, monkeypatch):
+    link, _ = many
     status = read_all(link, most=129)
     assert (len(status.jobs), status.next != "") == (256, True)
     monkeypatch.setattr(job_client, "MAX_PAGES", 1)

@@ -563,8 +563,13 @@ def _age_s(at_s: float | None, now_s: float) -> float | None:
 
 
 def _has_all(reply: Status) -> bool:
-    """Whether a status reply names all jobs; one of a sender that counts none may have had no room for more."""
-    return not reply.next and (bool(reply.counts) or len(reply.jobs) < auction.MOST_JOBS)
+    """Whether a status reply names all jobs.
+
+    A job that changes its state between two pages may be on none. A sender that does not count jobs may have had no
+    room for more.
+    """
+    counted = sum(reply.counts.values()) <= len(reply.jobs) if reply.counts else len(reply.jobs) < auction.MOST_JOBS
+    return counted and not reply.next
 
 
 def _most_urgent(statuses: Sequence[JobStatus], most: int) -> tuple[JobStatus, ...]:

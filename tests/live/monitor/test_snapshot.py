@@ -93,12 +93,16 @@ def test_a_restarted_fleet_counts_its_results_anew():
     assert seen.snapshot(3.0).counts == {"awarded": 1}
 
 
-@pytest.mark.parametrize("change", [{"next": "3 1.0 x"}, {"counts": {}}], ids=["more follow", "jobs are not counted"])
+@pytest.mark.parametrize(
+    "change",
+    [{"counts": {"finished": 128}, "next": "3 1.0 x"}, {"counts": {}}, {"counts": {"finished": 129}}],
+    ids=["more follow", "jobs are not counted", "a job has changed between two pages"],
+)
 def test_an_incomplete_status_reply_drops_no_job(change):
     names = [f"{number:03d}" for number in range(128)]
     seen = FleetView("f")
     seen.update("au", result(0, "old", "finished"), 0.0)
-    full = msgspec.structs.replace(stands(5.0, *names), **{"counts": {"finished": 129}, **change})
+    full = msgspec.structs.replace(stands(5.0, *names), **change)
     seen.update_jobs(full, 2.0)
     seen.forget_other_jobs([full], 1.0)
     assert sum(seen.snapshot(2.0).counts.values()) == 129
