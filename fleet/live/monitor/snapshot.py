@@ -346,8 +346,8 @@ class FleetView:
     def forget_other_jobs(self, replies: Sequence[Status], asked_s: float) -> None:
         """Evict jobs that are in no reply to a request for all jobs, and in no message since `asked_s`.
 
-        They are of an earlier fleet, or follow the first `MAX_JOBS` and are only counted. A reply that should have more
-        jobs changes nothing.
+        They are of an earlier fleet, or follow the first `MAX_JOBS` of a large one and are only counted. A reply that
+        lacks other jobs changes nothing.
         """
         if not replies or not all(_has_all(reply) or len(reply.jobs) >= MAX_JOBS for reply in replies):
             return
@@ -364,8 +364,11 @@ class FleetView:
         return Counter(job.status.state for job in self._jobs.values())
 
     def snapshot(self, now_s: float, jobs: int = MAX_JOBS) -> FleetSnapshot:
-        """The fleet at the real second `now_s`, with at most `jobs` jobs: those that need a person, are in work, or
-        wait, before those that have ended, and then those that changed last."""
+        """The fleet at the real second `now_s`, with at most `jobs` jobs.
+
+        Of more jobs it has those that need a person, then those in work, those that wait, and the others; of these
+        those that changed last.
+        """
         statuses = [job.status for job in self._jobs.values()]
         ended = {status.job for status in statuses if status.state in ("finished", "unfinished")}
         waiting = {status.job: status.reason for status in statuses if status.state == "waiting"}
@@ -573,7 +576,7 @@ def _has_all(reply: Status) -> bool:
 
 
 def _most_urgent(statuses: Sequence[JobStatus], most: int) -> tuple[JobStatus, ...]:
-    """Return at most `most` statuses in their order: by their urgency, and of the last group the last ones."""
+    """Return at most `most` statuses in their order: the most urgent, and of equally urgent ones the last."""
 
     def order(i: int) -> tuple[int, int]:
         return urgency(statuses[i].state, shift_ended=statuses[i].shift_ended), -i
