@@ -162,7 +162,7 @@ class AsyncBridge:
         await asyncio.to_thread(self._thread.join)
 
     async def snapshot(self, jobs: int = MAX_JOBS) -> FleetSnapshot:
-        """Return the fleet as it is now, with at most `jobs` of the jobs that changed last."""
+        """Return the fleet as it is now, with at most `jobs` jobs, as `FleetView.snapshot`."""
         return await self._on_bus(lambda done: done(self._listener.view.snapshot(time.monotonic(), jobs)))
 
     async def ask(self, key: str, request: msgspec.Struct, kind: type[Reply]) -> Reply:
