@@ -336,7 +336,7 @@ def train_log(
         FleetError: a recording has no temperatures, nothing stayed cool, the latent space of a joint collapsed, or the
             seed is no integer from 0 to `MAX_SEED`.
     """
-    if problem := Option(help="", low=0, high=MAX_SEED, is_integer=True).problem("seed", seed):
+    if problem := Option(help="", low=0, high=MAX_SEED, kind=int).problem("seed", seed):
         raise FleetError(problem)
     check_recordings(recordings)
     blind = [recording.name for recording in recordings if recording.temp_c is None]

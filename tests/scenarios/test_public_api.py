@@ -3,12 +3,17 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 import thermofleet as tf
+from fleet.bus.exchange.channel import Channel
 from fleet.errors import FleetError
+from scenarios.spec.options import LiveSpec, RunSpec, StudySpec
 from scenarios.table import Table
+from twin.vae.config import TwinConfig
 
 ROOT = Path(__file__).parents[2]
 
@@ -75,6 +80,32 @@ class Mine:
 def test_arguments_are_checked(call, says):
     with pytest.raises(FleetError, match=says):
         call()
+
+
+@pytest.mark.parametrize(
+    ("kind", "field", "value", "says"),
+    [
+        (Channel, "loss", "a", r"Channel\.loss must be a number \(got 'a'\)"),
+        (Channel, "loss", True, r"loss must be a number \(got True\)"),
+        (Channel, "loss", np.float32("nan"), r"loss must be 0 to 1 \(got nan\)"),
+        (RunSpec, "seed", None, r"RunSpec\.seed must be an integer \(got None\)"),
+        (RunSpec, "seed", 2**32, r"seed must be 0 to 4294967295 \(got 4294967296\)"),
+        (RunSpec, "plant", 3, r"No plant '3'\. Allowed: mujoco, profile\."),
+        (LiveSpec, "fleet", 3, r"fleet must have .* \(got '3'\)"),
+        (TwinConfig, "allow_collapse", "no", r"allow_collapse must be True or False \(got 'no'\)"),
+        (StudySpec, "decision_limit_s", "60", r"decision_limit_s must be a number \(got '60'\)"),
+    ],
+)
+def test_fields_are_checked(kind, field, value, says):
+    with pytest.raises(ValueError, match=says):
+        kind(**{field: value})
+
+
+def test_numbers_of_numpy_become_plain_ones():
+    numbers: Any = {"topology": "random_geometric", "radius": np.float32(0.5), "topology_seed": np.uint8(3)}
+    channel = Channel(**numbers)
+    assert [type(number) for number in (channel.radius, channel.topology_seed)] == [float, int]
+    assert StudySpec(decision_limit_s=None).decision_limit_s is None
 
 
 def test_a_policy_that_needs_arguments_is_refused_before_a_preparation(tmp_path, monkeypatch):
