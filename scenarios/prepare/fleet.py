@@ -63,6 +63,9 @@ class Fleet:
     """The fleets of `randomise.variants`."""
     planned: tuple[PlannedArm, ...] = ()
     """What `prepare` planned, for another scenario of the same cell."""
+    difficulty: DifficultyName = "twin"
+    risk: RiskName = RISK
+    """As in `prepare`."""
 
     @property
     def all(self) -> tuple["Fleet", ...]:
@@ -114,7 +117,10 @@ def prepare(
         robots = [arm.robot for arm in arms]
         space = made.space if made else space_of(spec, robots, plans, _folder(cache), share)
         refused = tuple(error for arm in planned for error in arm.infeasible)
-        fleets.append(Fleet(spec, tuple(arms), refused, space, planned=tuple(planned)))
+
+        fleets.append(
+            Fleet(spec, tuple(arms), refused, space, planned=tuple(planned), difficulty=difficulty, risk=risk)
+        )
     late = list(unfinishable_jobs(specs[0], fleets[0].planned))
     for sentence in late[:REASONS]:
         _LOG.warning("%s", sentence)

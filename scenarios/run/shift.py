@@ -46,7 +46,8 @@ def run(
     """Run one shift; it ends early, between two steps, once `stopped` returns True.
 
     Args:
-        fleet: A prepared fleet, or a scenario (a library name, a .toml file, a `Scenario`), which is prepared first.
+        fleet: A prepared fleet, whose predictions are used, or a scenario (a library name, a .toml file, a `Scenario`),
+            which is prepared first.
         spec: What to run; without it, `options` are its fields: policy, seed, plant, bus ("memory" here: nothing is
             published), difficulty, risk, channel; `thermofleet run --help` explains them.
         progress: Called with a stage and a share. The first run of a scenario prepares its arms for minutes.
@@ -72,7 +73,9 @@ def run(
     check_name(spec.policy)
     with blaming(spec.policy, "loading"):  # before the fleet is prepared for minutes
         scope_of(spec.policy)
-    if not isinstance(fleet, Fleet):
+    if isinstance(fleet, Fleet):
+        spec = _of_fleet(fleet, spec, options)
+    else:
         fleet = prepare(fleet, difficulty=spec.difficulty, risk=spec.risk, progress=progress)
     if out is not None:
         with new_folder(Path(out), RUN) as folder:
@@ -143,6 +146,26 @@ def run(
         jobs=job_records(world, state),
         offers=tuple(offers),
     )
+
+
+def _of_fleet(fleet: Fleet, spec: RunSpec, options: Mapping[str, Any]) -> RunSpec:
+    """The spec with the predictions of a prepared fleet.
+
+    Args:
+        options: Given options; a field of `spec` that differs from its default counts as given, too.
+
+    Raises:
+        FleetError: an option contradicts the fleet.
+    """
+    for name in ("difficulty", "risk"):
+        given, prepared = getattr(spec, name), getattr(fleet, name)
+        if given != prepared and (name in options or given != getattr(RunSpec, name)):
+            raise FleetError(
+                f"This fleet is prepared with {name}='{prepared}' (got {name}='{given}'); leave the option out, or "
+                "prepare another fleet."
+            )
+        spec = replace(spec, **{name: prepared})
+    return spec
 
 
 def _with_prediction(event: Event, seen: Mapping[str, Observation], actions: Mapping[str, int]) -> Event:

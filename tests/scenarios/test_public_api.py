@@ -122,3 +122,17 @@ def test_a_policy_that_needs_arguments_is_refused_before_a_preparation(tmp_path,
 def test_a_table_is_printed_as_the_command_prints_it():
     table = Table(head=("policy", "jobs"), rows=(("wspt", "71"), ("wsept", "79")), notes=("Two shifts.",))
     assert str(table).split() == ["policy", "jobs", "wspt", "71", "wsept", "79", "Two", "shifts."]
+
+
+def test_the_card_of_a_prepared_fleet_has_its_predictions_and_plain_numbers(small_toml, plans, tmp_path):
+    oracle = tf.prepare(small_toml, difficulty="oracle", cache=plans)
+    card = tf.run(oracle, policy="wspt", seed=np.int64(3), out=tmp_path / "run").card
+    assert (card["difficulty"], card["seed"], type(card["seed"])) == ("oracle", 3, int)
+    assert tf.open_run(tmp_path / "run").card["difficulty"] == "oracle"
+    other: Any
+    for other in ({"difficulty": "blind"}, {"difficulty": "twin"}, {"risk": "rc-nominal"}):
+        says = r"is prepared with (difficulty='oracle'|risk='rc') \(got .* leave the option out"
+        with pytest.raises(FleetError, match=says):
+            tf.run(oracle, policy="wspt", **other)
+    with pytest.raises(FleetError, match=r"is prepared with difficulty='oracle' \(got difficulty='blind'\)"):
+        tf.run(oracle, RunSpec(policy="wspt", difficulty="blind"))
