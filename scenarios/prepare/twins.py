@@ -32,7 +32,7 @@ from scenarios.progress import Count, Progress, quiet
 from scenarios.result_folder import ResultKind
 from scenarios.spec.jobs import rehearsal_works
 from scenarios.spec.schema import Scenario, TwinSpec
-from twin.logs.recording import NothingCool, Recording, Stretch, check_recordings, cool_stretches
+from twin.logs.recording import NothingCool, Recording, Stretch, check_log, cool_stretches
 from twin.vae.config import TwinConfig, training_key
 from twin.vae.measures import Features
 from twin.vae.twin import CARD as TWIN_CARD
@@ -338,7 +338,7 @@ def train_log(
     """
     if problem := Option(help="", low=0, high=MAX_SEED, kind=int).problem("seed", seed):
         raise FleetError(problem)
-    check_recordings(recordings)
+    check_log(recordings)
     blind = [recording.name for recording in recordings if recording.temp_c is None]
     if blind:
         raise FleetError(

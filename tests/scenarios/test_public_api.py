@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from fleet.bus.exchange.channel import Channel
 from fleet.errors import FleetError
 from scenarios.spec.options import LiveSpec, RunSpec, StudySpec
 from scenarios.table import Table
+from tests.logs import COOL, TINY
 from twin.vae.config import TwinConfig
 
 ROOT = Path(__file__).parents[2]
@@ -106,6 +108,24 @@ def test_numbers_of_numpy_become_plain_ones():
     channel = Channel(**numbers)
     assert [type(number) for number in (channel.radius, channel.topology_seed)] == [float, int]
     assert StudySpec(decision_limit_s=None).decision_limit_s is None
+
+
+@pytest.mark.parametrize("learn", [tf.identify, lambda given: tf.train_twin(given, TINY, seed=0, cool_c=40.0)])
+@pytest.mark.parametrize(
+    ("given", "error", "says"),
+    [
+        ([], FleetError, r"At least one recording is needed \(got none\)"),
+        (
+            [COOL[0], COOL[1], replace(COOL[2], name=COOL[1].name)],
+            FleetError,
+            "given more than once: cool_1. Give each",
+        ),
+        (COOL[0], TypeError, r"A list of recordings is needed \(got one, 'cool_0'\); put it in brackets"),
+    ],
+)
+def test_a_log_is_a_list_of_recordings_with_names_of_their_own(learn, given, error, says):
+    with pytest.raises(error, match=says):
+        learn(given)
 
 
 def test_a_policy_that_needs_arguments_is_refused_before_a_preparation(tmp_path, monkeypatch):

@@ -455,8 +455,6 @@ def test_logs_split_at_gaps_and_keep_the_mean_heat(rng):
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (lambda r: [], "at least one recording"),
-        (lambda r: [r, r], "Names of recordings must differ"),
         (lambda r: [replace(r, temp_c=None)], "no motor temperatures. Record"),
         (lambda r: [replace(r, temp_c=np.full_like(r.temp_c, 30.0))], "No motor warms or cools"),
         (lambda r: [replace(r, current_a=0.0 * r.current_a)], "copper loss is unknown"),

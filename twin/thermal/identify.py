@@ -10,7 +10,6 @@ parameters (variable projection: Golub & Pereyra 1973; Jacobian in Kaufman's for
 """
 
 import hashlib
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -41,7 +40,7 @@ from twin.logs.recording import (
     CurrentSource,
     HeatLog,
     Recording,
-    check_recordings,
+    check_log,
     heat_logs,
     source_of,
 )
@@ -502,11 +501,11 @@ def identify(
         free: Names of `twin.thermal.identify.PRIOR_SD`; the others keep their nominal values.
 
     Raises:
-        IdentificationError: the recordings are insufficient: none, wrong number of joints, no temperatures, too
-            short, no motor that warms or cools, no current.
-        FleetError: see `check_ambient`.
+        IdentificationError: the recordings are insufficient: wrong number of joints, no temperatures, too short, no
+            motor that warms or cools, no current.
+        FleetError: see `check_log` and `check_ambient`.
     """
-    check_recordings(recordings)
+    check_log(recordings)
     nominal = nominal or nominal_heat_model()
     sd_k = thermal_data()["spread"]["ambient_k"] if ambient_sd_k is None else ambient_sd_k
     if sd_k < 0:
@@ -590,7 +589,7 @@ def _rms(logs: Sequence[HeatLog], unexplained: Sequence[Array]) -> dict[str, tup
 def _hash(recordings: Sequence[Recording]) -> str:
     digest = hashlib.sha256()
     for recording in recordings:
-        digest.update(recording.name.encode())
+        digest.update("/".join(recording.name.split("/")[-2:]).encode())  # without the folder, which may be renamed
         for channel in ("time_s", *READINGS):
             if (values := getattr(recording, channel)) is not None:
                 digest.update(channel.encode() + np.ascontiguousarray(values, dtype=float).tobytes())
@@ -598,10 +597,6 @@ def _hash(recordings: Sequence[Recording]) -> str:
 
 
 def _check_recordings(recordings: Sequence[Recording]) -> None:
-    if not recordings:
-        raise IdentificationError("Identification needs at least one recording (got none).")
-    if twice := sorted(name for name, count in Counter(r.name for r in recordings).items() if count > 1):
-        raise IdentificationError(f"Names of recordings must differ; given more than once: {', '.join(twice)}.")
     for recording in recordings:
         if recording.temp_c is None:
             raise IdentificationError(
