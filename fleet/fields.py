@@ -8,7 +8,7 @@ from numbers import Integral, Real
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin
 
-from fleet.errors import NAME_RULE, is_name, nearest, printable
+from fleet.errors import NAME_RULE, ArgumentError, is_name, nearest, printable
 
 MAX_SEED = 2**32 - 1
 MIN_SPEED, MAX_SPEED = 0.001, 10_000.0
@@ -120,6 +120,37 @@ def options_of(kind: type) -> Mapping[str, Option]:
     return {each.name: known for each in fields(kind) if (known := option_of(each, each.type))}
 
 
+def check_value(name: str, value: Any, kind: type | None = None, **more: Any) -> Any:
+    """Check an argument of a function, and return it; a number of NumPy becomes a plain one.
+
+    Args:
+        kind, more: Fields of `Option`.
+
+    Raises:
+        ArgumentError: names the argument, the value and what is allowed.
+    """
+    if problem := Option(help="", kind=kind, **more).problem(name, value):
+        raise ArgumentError(problem)
+    return _plain(value)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Real) and type(value) not in (bool, int, float):
+        return int(value) if isinstance(value, Integral) else float(value)
+    return value
+
+
+def check_instance(name: str, value: object, kind: type, example: str) -> None:
+    """Check that an argument of a function is an instance of a class.
+
+    Raises:
+        ArgumentError: names the argument, the value, the class and an example of it.
+    """
+    if not isinstance(value, kind):
+        shown = printable(repr(value), 80)
+        raise ArgumentError(f"{name} must be of type {kind.__name__}, for example {example} (got {shown}).")
+
+
 def check(value: object) -> None:
     """Check the fields of a dataclass, in its `__post_init__`; numbers of NumPy become plain ones.
 
@@ -130,5 +161,4 @@ def check(value: object) -> None:
         given = getattr(value, name)
         if problem := known.problem(f"{type(value).__name__}.{name}", given):
             raise ValueError(problem)
-        if isinstance(given, Real) and not isinstance(given, int | float):
-            object.__setattr__(value, name, int(given) if isinstance(given, Integral) else float(given))
+        object.__setattr__(value, name, _plain(given))

@@ -1,8 +1,10 @@
 """The names of `import thermofleet`: each is there, loaded when it is used, and works from the name of a scenario."""
 
+import math
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +128,46 @@ def test_numbers_of_numpy_become_plain_ones():
 def test_a_log_is_a_list_of_recordings_with_names_of_their_own(learn, given, error, says):
     with pytest.raises(error, match=says):
         learn(given)
+
+
+train: Any = partial(tf.train_twin, COOL)
+identify: Any = partial(tf.identify, COOL)
+forecast: Any = partial(tf.forecast, COOL[0], COOL[0])
+quick = {"config": TINY, "seed": 0, "cool_c": 40.0}
+
+
+@pytest.mark.parametrize(
+    ("call", "given", "says"),
+    [
+        (train, quick | {"hold_out": -1}, r"hold_out must be 0 to 0.9 \(got -1\)"),
+        (train, quick | {"hold_out": "x"}, r"hold_out must be a number \(got 'x'\)"),
+        (train, quick | {"cool_c": math.nan}, r"cool_c must be 0 to 200 \(got nan\)"),
+        (train, quick | {"cool_c": None}, r"cool_c must be a number \(got None\)"),
+        (train, quick | {"seed": None}, r"seed must be an integer \(got None\)"),
+        (train, quick | {"config": TwinConfig}, r"of type TwinConfig, for example .* \(got <class 'twin"),
+        (identify, {"nominal": "gen3"}, r"nominal must be of type HeatModel, for example .* \(got 'gen3'\)"),
+        (identify, {"ambient_c": None}, r"ambient_c must be a number \(got None\)"),
+        (identify, {"ambient_c": math.nan}, r"ambient_c must be -40 to 60 \(got nan\)"),
+        (identify, {"ambient_sd_k": math.inf}, r"ambient_sd_k must be 0 to 100 \(got inf\)"),
+        (identify, {"step_s": 0}, r"step_s must be > 0 and at most 600 \(got 0\)"),
+        (identify, {"arm": None}, r"arm must have 1 to 128 printable .* \(got 'None'\)"),
+        (forecast, {"network": "x"}, r"network must be of type Identified, .* \(got 'x'\)"),
+        (forecast, {"ambient_c": math.nan}, r"ambient_c must be -40 to 60 \(got nan\)"),
+        (forecast, {"repetitions": 1.5}, r"repetitions must be an integer \(got 1.5\)"),
+        (forecast, {"repetitions": 0}, r"repetitions must be 1 to 1000000 \(got 0\)"),
+        (forecast, {"seed": None}, r"seed must be an integer \(got None\)"),
+    ],
+)
+def test_arguments_of_twins_are_checked(call, given, says):
+    with pytest.raises(ValueError, match=says) as error:
+        call(**given)
+    assert isinstance(error.value, FleetError)
+
+
+def test_free_parameters_are_a_list_of_names():
+    for free in (None, 3, "idle_w", ["idle"]):
+        with pytest.raises(ValueError, match=r"Free parameters must be some of copper_w_per_a2, .*, each once \(got"):
+            identify(free=free)
 
 
 def test_a_policy_that_needs_arguments_is_refused_before_a_preparation(tmp_path, monkeypatch):

@@ -19,7 +19,8 @@ import msgspec
 import networkx as nx
 import numpy as np
 
-from fleet.errors import FleetError, IdentificationError
+from fleet.errors import ArgumentError, FleetError, IdentificationError
+from fleet.fields import check_instance, check_value
 from fleet.heat.motor import Motors, copper_loss, gen3_motors, magnet_factor, thermal_data
 from fleet.heat.thermal import (
     HOUSING,
@@ -128,8 +129,8 @@ class ParameterVector:
     """Free parameters of one arm as a vector of logarithms, with their Gaussian prior around a nominal arm."""
 
     def __init__(self, nominal: HeatModel, free: Sequence[str] = tuple(PRIOR_SD)) -> None:
-        if not free or set(free) - set(PRIOR_SD) or len(set(free)) != len(free):
-            raise ValueError(f"Free parameters must be some of {', '.join(PRIOR_SD)}, each once (got {tuple(free)}).")
+        if not isinstance(free, Sequence) or not free or set(free) - set(PRIOR_SD) or len(set(free)) != len(free):
+            raise ArgumentError(f"Free parameters must be some of {', '.join(PRIOR_SD)}, each once (got {free!r}).")
         self.nominal = nominal
         self.free = tuple(free)
         self._held = {name: nominal.value(name) for name in PRIOR_SD}
@@ -499,17 +500,22 @@ def identify(
             rooms, and motors that are cooler than the ambient temperature are refused. Differences between recordings
             are attributed to it, not to the arm.
         free: Names of `twin.thermal.identify.PRIOR_SD`; the others keep their nominal values.
+        step_s: Length of a step of the simulation.
 
     Raises:
         IdentificationError: the recordings are insufficient: wrong number of joints, no temperatures, too short, no
             motor that warms or cools, no current.
-        FleetError: see `check_log` and `check_ambient`.
+        FleetError: an argument is not allowed; see `check_log` and `check_ambient`.
     """
     check_log(recordings)
-    nominal = nominal or nominal_heat_model()
+    check_value("arm", arm, is_name=True)
+    ambient_c = check_value("ambient_c", ambient_c, float, low=-40, high=60)
+    ambient_sd_k = check_value("ambient_sd_k", ambient_sd_k, float, low=0, high=100, takes_none=True)
+    step_s = check_value("step_s", step_s, float, low=0, high=RESIDUAL_S, above=True)
+    nominal = nominal_heat_model() if nominal is None else nominal
+    check_instance("nominal", nominal, HeatModel, "nominal_heat_model()")
+    vector = ParameterVector(nominal, free)
     sd_k = thermal_data()["spread"]["ambient_k"] if ambient_sd_k is None else ambient_sd_k
-    if sd_k < 0:
-        raise ValueError(f"ambient_sd_k must be >= 0 (got {sd_k}).")
     _check_recordings(recordings)
     if ambient_sd_k is None:
         for recording in recordings:
@@ -517,7 +523,6 @@ def identify(
     source = source_of(recordings)
     logs = [log for r in recordings for log in heat_logs(r, nominal.motors, source, step_s=step_s)]
     _check_logs(logs, nominal)
-    vector = ParameterVector(nominal, free)
     problem, x = _fit(logs, ambient_c, sd_k, vector)
     jacobian = problem.jacobian(x)
     information = np.linalg.cholesky(jacobian.T @ jacobian).T
