@@ -57,7 +57,9 @@ def test_a_shift_and_a_comparison_from_the_file_of_a_scenario(small_toml, plans,
     again = tf.open_run(tmp_path / "run")
     assert (again.metrics, again.reward, len(again.events)) == (shift.metrics, shift.reward, len(shift.events))
     assert "<" in shift._repr_html_()
-    result = tf.compare(small_toml, ["round_robin", "wspt"], seeds=range(2), difficulty="blind", workers=1)
+    seeds: Any = [0, np.int64(1)]
+    result = tf.compare(small_toml, ["round_robin", "wspt"], seeds=seeds, difficulty="blind", workers=1)
+    assert [type(seed) for seed in result.seeds] == [int, int]
     assert result.baseline == "round_robin"
     assert "wspt" in result.table.markdown()
 
@@ -78,6 +80,21 @@ class Mine:
         (lambda: tf.run("quickstart", seed=1.5), r"^seed must be an integer \(got 1.5\)"),
         (lambda: tf.run("quickstart", polcy="wspt"), r"no option 'polcy'; did you mean 'policy'\? Allowed: bus, "),
         (lambda: tf.prepare("quickstart", training=1.5), r"training must be an integer >= 0 \(got 1.5\)"),  # pyright: ignore
+        (lambda: tf.run("quickstart", "wspt"), r"^Options are given by name, as policy='wspt' \(got 'wspt'\)"),  # pyright: ignore
+        (lambda: tf.run("quickstart", channel="star"), r"^channel must be of type Channel, .* \(got 'star'\)"),
+        (lambda: tf.run("quickstart", record="no"), r"record must be True or False \(got 'no'\)"),  # pyright: ignore
+        (lambda: tf.run("quickstart", progress=None), r"progress must be a function of .* \(got None\)"),  # pyright: ignore
+        (lambda: tf.run("quickstart", stopped=None), r"stopped must be a function without .* \(got None\)"),  # pyright: ignore
+        (lambda: tf.run("quickstart", endpoint="tcp/x:1"), r"endpoint needs bus='zenoh' \(.* and bus='memory'\)"),
+        (lambda: tf.run("quickstart", out=3), r"out must be the path of a folder \(got 3\)"),  # pyright: ignore
+        (lambda: tf.run("quickstart", out=""), r"out must be the path of a folder \(got ''\)"),
+        (lambda: tf.run("quickstart", out=ROOT), r"holds other files .*; out needs a new folder"),
+        (lambda: tf.run("quickstart", out=ROOT / "x.csv"), r"^out must be a folder, without the ending"),
+        (lambda: tf.open_run(None), r"folder must be the path of a folder \(got None\)"),  # pyright: ignore
+        (lambda: tf.compare("quickstart", ["wspt"], channel=3), r"channel must be of type Channel, .* \(got 3\)"),  # pyright: ignore
+        (lambda: tf.compare("quickstart", ["wspt"], workers=1.5), r"workers must be an integer >= 1, .* \(got 1.5\)"),  # pyright: ignore
+        (lambda: tf.compare("quickstart", ["wspt"], progress=None), r"progress must be a function .* \(got None\)"),  # pyright: ignore
+        (lambda: tf.prepare("quickstart", like=3), r"like must be of type Fleet, for example .* \(got 3\)"),  # pyright: ignore
         (lambda: tf.make_env("quickstart", slot=3), "Allowed: ahead_s, ambient, arms, bids, breaks, bus, cache, "),
     ],
 )  # fmt: skip
@@ -191,6 +208,10 @@ def test_the_card_of_a_prepared_fleet_has_its_predictions_and_plain_numbers(smal
     card = tf.run(oracle, policy="wspt", seed=np.int64(3), out=tmp_path / "run").card
     assert (card["difficulty"], card["seed"], type(card["seed"])) == ("oracle", 3, int)
     assert tf.open_run(tmp_path / "run").card["difficulty"] == "oracle"
+    with pytest.raises(FleetError, match=r"holds a finished run; give another out\.$"):
+        tf.run(oracle, policy="wspt", out=tmp_path / "run")
+    with pytest.raises(FleetError, match=r"or a Scenario \(got a Fleet; give its .scenario\)"):
+        tf.make_env(oracle)  # pyright: ignore
     other: Any
     for other in ({"difficulty": "blind"}, {"difficulty": "twin"}, {"risk": "rc-nominal"}):
         says = r"is prepared with (difficulty='oracle'|risk='rc') \(got .* leave the option out"
