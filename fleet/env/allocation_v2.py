@@ -8,7 +8,7 @@ lower index.
 It is one row of a batch (`fleet.env.vector`), with a plant that moves the arms, events and a watcher.
 """
 
-from copy import copy
+from copy import copy, deepcopy
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -138,6 +138,9 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         self.state_space = spaces.Box(np.tile(low, len(arms)), np.tile(high, len(arms)), dtype=np.float32)
         self._started, self._tick = False, 0
         self._delivered_before = 0
+
+    def __copy__(self) -> "AllocationEnv":
+        return deepcopy(self)
 
     def _draw(self, seed: np.random.SeedSequence) -> Shift:
         self._episode = self._make_episode(seed)

@@ -9,6 +9,7 @@ import ctypes
 import os
 import sys
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any, get_args
 
@@ -231,6 +232,9 @@ class BatchEnv:
         """Of the jobs of each env."""
         self._delivered = None if exchanges is None else self._no_parts()
         """Knowledge of the arms with their received messages; only with exchanges."""
+
+    def __copy__(self) -> "BatchEnv":
+        return deepcopy(self)
 
     @property
     def state(self) -> State:

@@ -23,7 +23,11 @@ from scenarios.prepare.fleet import Fleet, env_of, prepare
 from scenarios.run.shift import RunLog, run
 from scenarios.spec.options import RunSpec
 
-COPIES: dict[str, Callable[[Any], Any]] = {"pickle": lambda env: pickle.loads(pickle.dumps(env)), "copy": copy.deepcopy}
+COPIES: dict[str, Callable[[Any], Any]] = {
+    "pickle": lambda env: pickle.loads(pickle.dumps(env)),
+    "copy": copy.copy,
+    "deepcopy": copy.deepcopy,
+}
 WHOLE = """
 import numpy as np
 from fleet.env.allocation_v2 import env as aec_env, parallel_env
