@@ -28,7 +28,15 @@ from fleet.engine.world import World
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.render.renderer import Renderer
 from fleet.env.render.scene import CellMap
-from fleet.env.validation import Decisions, actions_of, agent_of, at_least_one, check_choice, seed_of
+from fleet.env.validation import (
+    Decisions,
+    actions_of,
+    agent_of,
+    at_least_one,
+    check_choice,
+    check_reset_options,
+    seed_of,
+)
 from fleet.env.vector import AHEAD_S, REWARDS, BatchEnv, Library, arm_spaces
 from fleet.events import Event
 from fleet.heat.thermal import WINDING
@@ -194,8 +202,9 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         """Start a new episode; return observations and infos by agent. Without a seed: the next child of the last seed.
 
         Raises:
-            ValueError: a seed that is no integer >= 0.
+            ValueError: a seed that is no integer from 0 to 2**32 - 1, or an option.
         """
+        check_reset_options(options)
         if seed is not None:
             self._seeds, entropy = seed_of(seed), seed_of(seed)
         else:
