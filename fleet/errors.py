@@ -12,6 +12,10 @@ class FleetError(Exception):
     """Base of all errors of thermofleet."""
 
 
+class ArgumentError(FleetError, ValueError):
+    """An argument of a function has another type, or a value that is not allowed."""
+
+
 class ScenarioError(FleetError):
     """Invalid scenario file; names the file, the place in it and what is allowed."""
 

@@ -4,10 +4,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import cache
 from math import inf
-from numbers import Integral
+from numbers import Integral, Real
+from types import NoneType
 from typing import Any, Literal, get_args, get_origin
 
-from fleet.errors import NAME_RULE, is_name, nearest, printable
+from fleet.errors import NAME_RULE, ArgumentError, is_name, nearest, printable
 
 MAX_SEED = 2**32 - 1
 MIN_SPEED, MAX_SPEED = 0.001, 10_000.0
@@ -27,7 +28,9 @@ class Option:
     """Whether the value must be more than `low`, not equal to it."""
     choices: tuple[str, ...] = ()
     """Allowed names."""
-    is_integer: bool = False
+    kind: type | None = None
+    """int, float or bool; None for other values. That of a field follows from its type."""
+    takes_none: bool = False
     noun: str = ""
     """What an error calls one of these names; "" for the name of the field."""
     is_name: bool = False
@@ -60,19 +63,24 @@ class Option:
             name: What the sentence calls the value, as `--seed` or `RunSpec.seed`.
             default: Allowed although it does not follow the rule for names.
         """
-        if self.choices and isinstance(value, str) and value not in self.choices:
+        if value is None and self.takes_none:
+            return ""
+        if self.choices and value not in self.choices:
             noun = self.noun or name.rpartition(".")[2].removeprefix("--").lower()
-            return f"No {noun} '{printable(value)}'{nearest(value, self.choices)}"
-        if self.is_name and isinstance(value, str) and value != default and not is_name(value):
-            return f"{name} must have {NAME_RULE} (got '{printable(value)}')."
-        if self.is_integer and value is not None and (isinstance(value, bool) or not isinstance(value, Integral)):
-            return f"{name} must be an integer (got {value!r})."
-        if isinstance(value, int | float) and not self._within(value):
-            return f"{name} must be {self.limits} (got {value:g})."
+            return f"No {noun} '{printable(str(value))}'{nearest(str(value), self.choices)}"
+        if self.is_name and value != default and not (isinstance(value, str) and is_name(value)):
+            return f"{name} must have {NAME_RULE} (got '{printable(str(value))}')."
+        if self.kind is bool:
+            return "" if isinstance(value, bool) else f"{name} must be True or False (got {value!r})."
+        number = Integral if self.kind is int else Real
+        if self.kind and (isinstance(value, bool) or not isinstance(value, number)):
+            return f"{name} must be {'an integer' if self.kind is int else 'a number'} (got {value!r})."
+        if self.kind and not self._within(value):
+            return f"{name} must be {self.limits} (got {value if isinstance(value, Integral) else f'{value:g}'})."
         return ""
 
-    def _within(self, value: float) -> bool:
-        return (self.low < value if self.above else self.low <= value) and value <= self.high  # NaN fails
+    def _within(self, value: Any) -> bool:  # a number, also of NumPy
+        return bool((self.low < value if self.above else self.low <= value) and value <= self.high)  # NaN fails
 
 
 def option(help: str, default: Any, **more: Any) -> Any:
@@ -91,13 +99,19 @@ def argument(help: str, default: Any = MISSING, **more: Any) -> Any:
 def option_of(given: "Field[Any]", kind: Any) -> Option | None:
     """The option that a field or parameter of a type is; None of any other field.
 
-    The names of a Literal type are the allowed ones, unless others are given; values of the type int are integers.
+    The names of a Literal type are the allowed ones, unless others are given.
     """
     known: Option | None = given.metadata.get(_KEY)
-    if known and kind in (int, int | None):
-        return replace(known, is_integer=True)
-    literal = next((each for each in (kind, *get_args(kind)) if get_origin(each) is Literal), None)
-    return replace(known, choices=get_args(literal)) if known and literal and not known.choices else known
+    if known is None:
+        return None
+    kinds = get_args(kind) if NoneType in get_args(kind) else (kind,)
+    literal = next((each for each in kinds if get_origin(each) is Literal), None)
+    return replace(
+        known,
+        choices=known.choices or get_args(literal),
+        kind=next((each for each in kinds if each in (int, float, bool)), None),
+        takes_none=NoneType in kinds,
+    )
 
 
 @cache
@@ -106,12 +120,45 @@ def options_of(kind: type) -> Mapping[str, Option]:
     return {each.name: known for each in fields(kind) if (known := option_of(each, each.type))}
 
 
+def check_value(name: str, value: Any, kind: type | None = None, **more: Any) -> Any:
+    """Check an argument of a function, and return it; a number of NumPy becomes a plain one.
+
+    Args:
+        kind, more: Fields of `Option`.
+
+    Raises:
+        ArgumentError: names the argument, the value and what is allowed.
+    """
+    if problem := Option(help="", kind=kind, **more).problem(name, value):
+        raise ArgumentError(problem)
+    return _plain(value)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Real) and type(value) not in (bool, int, float):
+        return int(value) if isinstance(value, Integral) else float(value)
+    return value
+
+
+def check_instance(name: str, value: object, kind: type, example: str) -> None:
+    """Check that an argument of a function is an instance of a class.
+
+    Raises:
+        ArgumentError: names the argument, the value, the class and an example of it.
+    """
+    if not isinstance(value, kind):
+        shown = printable(repr(value), 80)
+        raise ArgumentError(f"{name} must be of type {kind.__name__}, for example {example} (got {shown}).")
+
+
 def check(value: object) -> None:
-    """Check the fields of a dataclass, in its `__post_init__`.
+    """Check the fields of a dataclass, in its `__post_init__`; numbers of NumPy become plain ones.
 
     Raises:
         ValueError: names the field, the value and what is allowed.
     """
     for name, known in options_of(type(value)).items():
-        if problem := known.problem(f"{type(value).__name__}.{name}", getattr(value, name)):
+        given = getattr(value, name)
+        if problem := known.problem(f"{type(value).__name__}.{name}", given):
             raise ValueError(problem)
+        object.__setattr__(value, name, _plain(given))

@@ -31,6 +31,29 @@ class ResultKind:
     """Patterns of every file the folder may hold."""
 
 
+def folder_at(name: str, path: object) -> Path:
+    """The folder whose path is given as an argument of a function.
+
+    Raises:
+        FleetError: it is no path; names the argument.
+    """
+    if not isinstance(path, str | Path) or path == "":
+        raise FleetError(f"{name} must be the path of a folder (got {path!r}).")
+    return Path(path)
+
+
+@contextmanager
+def argument_names() -> Iterator[None]:
+    """Name the argument `out` of a function in errors, in place of options of the command line."""
+    try:
+        yield
+    except FleetError as error:
+        if type(error) is not FleetError:
+            raise
+        text = str(error).replace(", or --overwrite to replace it", "").replace("--out", "out")
+        raise FleetError(text) from error
+
+
 @contextmanager
 def new_folder(out: Path, kind: ResultKind, *, overwrite: bool = False) -> Iterator[Path]:
     """A temporary folder that is renamed to `out` when the block succeeds, and removed when it fails.

@@ -33,6 +33,7 @@ from agents.learned.config import PpoConfig
 from agents.learned.policy import Actor, Critic, draw, has_choice, masked
 from agents.policy import WAIT
 from fleet.errors import CheckpointError
+from fleet.fields import MAX_SEED
 from fleet.files import atomic_path
 from fleet.observation import Layout
 
@@ -180,7 +181,7 @@ class Trainer:
             while True:
                 turn = self.done % len(self._cells)
                 if turn not in collectors:
-                    collector = self._cells[turn].collect(self.config, seed + turn)
+                    collector = self._cells[turn].collect(self.config, (seed + turn) % (MAX_SEED + 1))
                     stack.callback(collector.shutdown)
                     collectors[turn] = iter(collector)
                 yield self._learn(next(collectors[turn]), self._cells[turn])

@@ -8,7 +8,7 @@ lower index.
 It is one row of a batch (`fleet.env.vector`), with a plant that moves the arms, events and a watcher.
 """
 
-from copy import copy
+from copy import copy, deepcopy
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -28,7 +28,15 @@ from fleet.engine.world import World
 from fleet.env.lookahead import CellSimulator, Lookahead
 from fleet.env.render.renderer import Renderer
 from fleet.env.render.scene import CellMap
-from fleet.env.validation import Decisions, actions_of, agent_of, at_least_one, check_choice, seed_of
+from fleet.env.validation import (
+    Decisions,
+    actions_of,
+    agent_of,
+    at_least_one,
+    check_choice,
+    check_reset_options,
+    seed_of,
+)
 from fleet.env.vector import AHEAD_S, REWARDS, BatchEnv, Library, arm_spaces
 from fleet.events import Event
 from fleet.heat.thermal import WINDING
@@ -139,6 +147,9 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         self._started, self._tick = False, 0
         self._delivered_before = 0
 
+    def __copy__(self) -> "AllocationEnv":
+        return deepcopy(self)
+
     def _draw(self, seed: np.random.SeedSequence) -> Shift:
         self._episode = self._make_episode(seed)
         return self._episode.shift
@@ -191,8 +202,9 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         """Start a new episode; return observations and infos by agent. Without a seed: the next child of the last seed.
 
         Raises:
-            ValueError: a seed that is no integer >= 0.
+            ValueError: a seed that is no integer from 0 to 2**32 - 1, or an option.
         """
+        check_reset_options(options)
         if seed is not None:
             self._seeds, entropy = seed_of(seed), seed_of(seed)
         else:

@@ -5,26 +5,30 @@ from typing import Literal, TypeGuard
 
 import numpy as np
 
+from fleet.fields import MAX_SEED
+
 Decisions = Literal["interval", "events"]
 """Length of a step: one decision interval, or until an arm may claim a job or passes its warning limit at work."""
 
 
 _LARGEST = 2**62
+IGNORED_OPTION = "options"
+"""Option of a reset that the tests of PettingZoo give."""
 
 
 def seed_of(seed: object) -> np.random.SeedSequence:
-    """Seed of a shift, of any size.
+    """Seed of a shift.
 
     Raises:
-        ValueError: no integer, or one below 0.
+        ValueError: no integer from 0 to `MAX_SEED`.
     """
-    if not _whole(seed) or seed < 0:
-        raise ValueError(f"seed must be an integer >= 0 (got {seed!r}).")
+    if not _whole(seed) or not 0 <= seed <= MAX_SEED:
+        raise ValueError(f"seed must be an integer from 0 to {MAX_SEED} (got {seed!r}).")
     return np.random.SeedSequence(int(seed))
 
 
 def seeds_of(seed: object, envs: int) -> list[np.random.SeedSequence]:
-    """Seeds of a batch: consecutive from one seed, one for each env, or random without any.
+    """Seeds of a batch: consecutive from one seed (0 follows `MAX_SEED`), one for each env, or random without any.
 
     Raises:
         ValueError: neither one seed nor one for each env.
@@ -32,20 +36,32 @@ def seeds_of(seed: object, envs: int) -> list[np.random.SeedSequence]:
     if seed is None:
         return np.random.SeedSequence().spawn(envs)
     if _whole(seed):
-        return [seed_of(int(seed) + e) for e in range(envs)]  # as a uint8, 255 + 1 would be 0
+        seed_of(seed)
+        return [seed_of((int(seed) + e) % (MAX_SEED + 1)) for e in range(envs)]  # as a uint8, 255 + 1 would be 0
     if isinstance(seed, list | tuple | range | np.ndarray) and np.shape(seed) == (envs,):
         return [seed_of(each) for each in seed]
     raise ValueError(f"seed must be one integer or one for each of {envs} envs (got {seed!r}).")
+
+
+def check_reset_options(options: object, *allowed: str) -> None:
+    """Raise a ValueError unless options of a reset are a mapping with no others than the allowed names, or None."""
+    if not isinstance(options, Mapping | None):
+        raise ValueError(f"options must be a dictionary or None (got {options!r}).")
+    if unknown := (options or {}).keys() - {*allowed, IGNORED_OPTION}:
+        raise ValueError(
+            f"reset() has no option {min(unknown, key=str)!r}. Allowed: {', '.join(allowed) or 'none'}. make_env() and "
+            "make_batch() change the scenario."
+        )
 
 
 def at_least_one(name: str, value: object) -> int:
     """A count.
 
     Raises:
-        ValueError: no integer, or one below 1.
+        ValueError: no integer, one below 1, or above 2**62.
     """
     if not _whole(value) or value < 1 or value > _LARGEST:
-        raise ValueError(f"{name} must be an integer >= 1 (got {value!r}).")
+        raise ValueError(f"{name} must be an integer from 1 to 2**62 (got {value!r}).")
     return int(value)
 
 
@@ -84,7 +100,7 @@ def actions_of(agents: Sequence[str], actions: object) -> np.ndarray:
         ValueError: no dictionary, an action that is no integer, or one of an agent that is not there.
     """
     if not isinstance(actions, Mapping):
-        raise ValueError(f"step() takes a dictionary of agents and their actions (got {actions!r}).")
+        raise ValueError(f"actions must be a dictionary of agents and their actions (got {actions!r}).")
     if unknown := actions.keys() - set(agents):
         agent_of(agents, min(unknown, key=str))
     return np.array([_integer(agent, actions.get(agent, 0)) for agent in agents], dtype=np.int64)

@@ -9,6 +9,7 @@ import ctypes
 import os
 import sys
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any, get_args
 
@@ -22,7 +23,15 @@ from fleet.engine.state import State
 from fleet.engine.step import FINISHED, JOBS_DONE, OUTCOME, TICK, TOTAL
 from fleet.engine.tables import INFO, Tables
 from fleet.env.lookahead import CellSimulator, Lookahead
-from fleet.env.validation import Decisions, at_least_one, check_choice, seeds_of, switch, time_from_zero
+from fleet.env.validation import (
+    Decisions,
+    at_least_one,
+    check_choice,
+    check_reset_options,
+    seeds_of,
+    switch,
+    time_from_zero,
+)
 from fleet.observation import Layout, Observation
 from fleet.seeding import exchange_seed, shift_seeds
 
@@ -232,6 +241,9 @@ class BatchEnv:
         self._delivered = None if exchanges is None else self._no_parts()
         """Knowledge of the arms with their received messages; only with exchanges."""
 
+    def __copy__(self) -> "BatchEnv":
+        return deepcopy(self)
+
     @property
     def state(self) -> State:
         """Copy of the true state of all envs (not for policies)."""
@@ -251,20 +263,26 @@ class BatchEnv:
         return self.engine.state.temp_c
 
     def reset(
-        self, seed: int | Sequence[int] | None = None, *, rows: Array | Sequence[int] | None = None
+        self,
+        seed: int | Sequence[int] | None = None,
+        *,
+        rows: Array | Sequence[int] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Obs, dict[str, Any]]:
         """Begin new shifts.
 
         Args:
             seed: Env e begins the shift of `seed + e`, or of `seed[e]`; without one, the next of its row's seed.
             rows: Only in these envs, int [n] or bool [env]; the others continue.
+            options: None, or empty.
 
         Returns:
             Observations, and the infos of `step`.
 
         Raises:
-            ValueError: an invalid seed or row.
+            ValueError: an invalid seed or row, or an option.
         """
+        check_reset_options(options)
         if seed is not None:
             if rows is not None:
                 raise ValueError("reset(seed=…) seeds all envs: give seed or rows, not both.")
@@ -276,7 +294,8 @@ class BatchEnv:
         self._begin(chosen)
         if len(chosen) < self.num_envs:
             self._observe(np.setdiff1d(self._all, chosen), self.parts)
-        nothing, self._elapsed_s = np.zeros((self.num_envs, OUTCOME)), np.zeros(self.num_envs)
+        nothing = np.zeros((self.num_envs, OUTCOME))
+        self._elapsed_s[chosen] = 0.0
         nothing[:, JOBS_DONE] = self.engine.state.done
         return self._obs(), self._info(nothing, np.zeros(0, dtype=int), None)
 
@@ -394,7 +413,7 @@ class BatchEnv:
         return {
             **{name: infos[name] for name in INFO.names or ()},
             "jobs_done": outcome[:, JOBS_DONE],
-            "elapsed_s": self._elapsed_s,
+            "elapsed_s": self._elapsed_s.copy(),
             **{name: outcome[:, n] for n, name in enumerate(REWARDS)},
             "final_envs": ended,
             "final_obs": last,

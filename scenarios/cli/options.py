@@ -121,7 +121,7 @@ def _parameter(name: str, kind: Any, known: Option, default: Any) -> inspect.Par
     called = name.upper() if known.is_argument else flag.partition("/")[0]
 
     def check(_: typer.CallbackParam, value: object) -> object:
-        if problem := known.problem(called, value, default):
+        if value is not None and (problem := known.problem(called, value, default)):
             raise FleetError(problem)
         return value
 

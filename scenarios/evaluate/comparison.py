@@ -26,7 +26,7 @@ from scenarios.evaluate.statistics import HEAD, LEGEND, Figure, Interval, fewest
 from scenarios.evaluate.study import Case, Row, Study, suite_label
 from scenarios.policy_loader import check_name, has_trainings, label, scope_of
 from scenarios.prepare.randomisation import Randomisation
-from scenarios.progress import Progress, quiet
+from scenarios.progress import Progress, check_progress, quiet
 from scenarios.spec.load import scenario_with
 from scenarios.spec.options import RISK, DifficultyName, RiskName
 from scenarios.spec.schema import Scenario
@@ -217,11 +217,12 @@ def compare(
         raise FleetError(
             f"A comparison needs a policy and a seed (got policies: {len(policies)}, seeds: {len(seeds)})."
         )
-    if workers < 1 and workers != -1:
-        raise FleetError(f"workers must be >= 1, or -1 for one per core (got {workers}).")
+    if not isinstance(workers, int) or isinstance(workers, bool) or (workers < 1 and workers != -1):
+        raise FleetError(f"workers must be an integer >= 1, or -1 for one per core (got {workers!r}).")
+    check_progress(progress)
     study = Study(
         policies=policies,
-        cases=[Case(name=chosen.name, scenario=chosen, seeds=tuple(seeds))],
+        cases=[Case(name=chosen.name, scenario=chosen, seeds=tuple(map(int, seeds)))],
         difficulties=[difficulty],
         risk=risk,
         randomise=randomise,

@@ -12,7 +12,7 @@ import numpy as np
 from agents.policy import PlanningPolicy, Policy
 from fleet.arm.plan_cache import rest_torque
 from fleet.arm.space import SpaceTable, space_table
-from fleet.bus.exchange.channel import PERFECT, Channel
+from fleet.bus.exchange.channel import PERFECT, Channel, check_channel
 from fleet.bus.exchange.memory import Exchange
 from fleet.difficulty import Blind
 from fleet.engine.batch import Shift
@@ -21,6 +21,7 @@ from fleet.engine.tables import Tables
 from fleet.engine.world import Arm, World, build_world, warm_start
 from fleet.env.lookahead import CellSimulator
 from fleet.errors import FleetError, InfeasibleJob, ScenarioError
+from fleet.fields import check_instance
 from fleet.files import cache_folder
 from fleet.job import Job, Work
 from fleet.motion import Plan
@@ -63,6 +64,9 @@ class Fleet:
     """The fleets of `randomise.variants`."""
     planned: tuple[PlannedArm, ...] = ()
     """What `prepare` planned, for another scenario of the same cell."""
+    difficulty: DifficultyName = "twin"
+    risk: RiskName = RISK
+    """As in `prepare`."""
 
     @property
     def all(self) -> tuple["Fleet", ...]:
@@ -102,6 +106,8 @@ def prepare(
     if not isinstance(training, int) or training < 0:
         raise FleetError(f"training must be an integer >= 0 (got {training!r}).")
     check_progress(progress)
+    if like is not None:
+        check_instance("like", like, Fleet, "the result of prepare()")
     specs = randomise.scenarios_of(scenario_with(scenario, {}, prepare))
     fleets: list[Fleet] = []
     for i, spec in enumerate(specs):
@@ -114,7 +120,10 @@ def prepare(
         robots = [arm.robot for arm in arms]
         space = made.space if made else space_of(spec, robots, plans, _folder(cache), share)
         refused = tuple(error for arm in planned for error in arm.infeasible)
-        fleets.append(Fleet(spec, tuple(arms), refused, space, planned=tuple(planned)))
+
+        fleets.append(
+            Fleet(spec, tuple(arms), refused, space, planned=tuple(planned), difficulty=difficulty, risk=risk)
+        )
     late = list(unfinishable_jobs(specs[0], fleets[0].planned))
     for sentence in late[:REASONS]:
         _LOG.warning("%s", sentence)
@@ -454,11 +463,10 @@ def make_env(
         overrides: Top-level fields of the scenario to change, for example `horizon_s=600`; Any, as fields differ.
 
     Raises:
-        ScenarioError: an argument is not allowed.
+        ArgumentError, ScenarioError: an argument is not allowed.
         FleetError: the fleet cannot be prepared.
     """
-    if not isinstance(channel, Channel):
-        raise ScenarioError(f"channel must be a fleet.bus.exchange.channel.Channel (got {channel!r}).")
+    check_channel(channel)
     if batched := sorted(_BATCHED & set(overrides)):
         raise ScenarioError(f"make_env() takes no {batched[0]}; only make_batch() does.")
     chosen = scenario_with(scenario, overrides, make_env)

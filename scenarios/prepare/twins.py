@@ -20,7 +20,7 @@ import numpy as np
 
 from fleet.arm.plan_cache import RANDOM_MOTIONS_VERSION
 from fleet.errors import CheckpointError, FleetError, nearest
-from fleet.fields import MAX_SEED, Option
+from fleet.fields import MAX_SEED, check_instance, check_value
 from fleet.files import cache_folder
 from fleet.heat.motor import Motors
 from fleet.heat.thermal import NODES, ThermalModel
@@ -32,7 +32,7 @@ from scenarios.progress import Count, Progress, quiet
 from scenarios.result_folder import ResultKind
 from scenarios.spec.jobs import rehearsal_works
 from scenarios.spec.schema import Scenario, TwinSpec
-from twin.logs.recording import NothingCool, Recording, Stretch, check_recordings, cool_stretches
+from twin.logs.recording import NothingCool, Recording, Stretch, check_log, cool_stretches
 from twin.vae.config import TwinConfig, training_key
 from twin.vae.measures import Features
 from twin.vae.twin import CARD as TWIN_CARD
@@ -333,12 +333,14 @@ def train_log(
         hold_out: Share of the cool recordings that are held out.
 
     Raises:
-        FleetError: a recording has no temperatures, nothing stayed cool, the latent space of a joint collapsed, or the
-            seed is no integer from 0 to `MAX_SEED`.
+        FleetError: an argument is not allowed, a recording has no temperatures, nothing stayed cool, or the latent
+            space of a joint collapsed.
     """
-    if problem := Option(help="", low=0, high=MAX_SEED, is_integer=True).problem("seed", seed):
-        raise FleetError(problem)
-    check_recordings(recordings)
+    check_log(recordings)
+    check_instance("config", config, TwinConfig, "TwinConfig.quick()")
+    seed = check_value("seed", seed, int, low=0, high=MAX_SEED)
+    cool_c = check_value("cool_c", cool_c, float, low=0, high=200)
+    hold_out = check_value("hold_out", hold_out, float, low=0, high=0.9)
     blind = [recording.name for recording in recordings if recording.temp_c is None]
     if blind:
         raise FleetError(

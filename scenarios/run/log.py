@@ -23,7 +23,7 @@ from fleet.errors import FleetError
 from fleet.events import Event
 from fleet.robot import JOINTS
 from fleet.telemetry import MODES, Telemetry
-from scenarios.result_folder import ResultKind, disk_errors
+from scenarios.result_folder import ResultKind, disk_errors, folder_at
 from scenarios.run.metrics import Metrics
 from scenarios.run.records import JobRecord, Offer, ShiftLog
 from scenarios.spec.options import RunSpec
@@ -153,7 +153,7 @@ def open_run(folder: str | Path) -> RunLog:
     Raises:
         FleetError: it is no folder of a run, not of this version, or damaged.
     """
-    folder = Path(folder)
+    folder = folder_at("folder", folder)
     try:
         card = json.loads((folder / "run.json").read_text(encoding="utf-8"))
         known, found = f"{RUN_FORMAT} in {VERSION}", f"{card['format']} in {card.get('environment', 'allocation_v0')}"

@@ -15,12 +15,13 @@ from fleet.env.allocation_v2 import AllocationEnv
 from fleet.env.validation import actions_of
 from fleet.errors import FleetError, nearest
 from fleet.events import Event
+from fleet.fields import check_value
 from fleet.observation import Observation
 from fleet.telemetry import Readings, Telemetry
 from scenarios.policy_loader import OnBus, blaming, check_name, policy_at, scope_of
 from scenarios.prepare.fleet import Fleet, env_of, let_plan, prepare
-from scenarios.progress import Progress, quiet
-from scenarios.result_folder import new_folder
+from scenarios.progress import Progress, check_progress, quiet
+from scenarios.result_folder import argument_names, check_free, folder_at, new_folder
 from scenarios.run.log import RUN, RunLog, card_of, provenance
 from scenarios.run.metrics import HeatUse, metrics_of
 from scenarios.run.records import Offer, job_records, offers_of
@@ -46,7 +47,8 @@ def run(
     """Run one shift; it ends early, between two steps, once `stopped` returns True.
 
     Args:
-        fleet: A prepared fleet, or a scenario (a library name, a .toml file, a `Scenario`), which is prepared first.
+        fleet: A prepared fleet, whose predictions are used, or a scenario (a library name, a .toml file, a `Scenario`),
+            which is prepared first.
         spec: What to run; without it, `options` are its fields: policy, seed, plant, bus ("memory" here: nothing is
             published), difficulty, risk, channel; `thermofleet run --help` explains them.
         progress: Called with a stage and a share. The first run of a scenario prepares its arms for minutes.
@@ -58,6 +60,8 @@ def run(
         FleetError: an option is not allowed, the fleet cannot be prepared, or the folder cannot be written.
         PolicyFailed: a user-defined policy raised an exception or returned no action.
     """
+    if not isinstance(spec, RunSpec | None):
+        raise FleetError(f"Options are given by name, as policy='wspt' (got {spec!r}).")
     if spec is None:
         try:
             spec = RunSpec(**{"bus": "memory", **options})
@@ -69,13 +73,25 @@ def run(
             raise FleetError(str(error).removeprefix("RunSpec.")) from error
     elif options:
         raise FleetError(f"Give either a RunSpec or single options, not both (got {', '.join(options)}).")
+    check_progress(progress)
+    if not callable(stopped):
+        raise FleetError(f"stopped must be a function without arguments, as lambda: False (got {stopped!r}).")
+    check_value("record", record, bool)
+    if endpoint is not None and spec.bus == "memory":
+        raise FleetError(f"endpoint needs bus='zenoh' (got endpoint={endpoint!r} and bus='memory').")
+    target = None if out is None else folder_at("out", out)
+    if target is not None:
+        with argument_names():
+            check_free(target, RUN, overwrite=False)
     check_name(spec.policy)
     with blaming(spec.policy, "loading"):  # before the fleet is prepared for minutes
         scope_of(spec.policy)
-    if not isinstance(fleet, Fleet):
+    if isinstance(fleet, Fleet):
+        spec = _of_fleet(fleet, spec, options)
+    else:
         fleet = prepare(fleet, difficulty=spec.difficulty, risk=spec.risk, progress=progress)
-    if out is not None:
-        with new_folder(Path(out), RUN) as folder:
+    if target is not None:
+        with argument_names(), new_folder(target, RUN) as folder:
             log = run(fleet, spec, progress=progress, stopped=stopped, record=record, endpoint=endpoint)
             log.write(folder)
         return log
@@ -143,6 +159,26 @@ def run(
         jobs=job_records(world, state),
         offers=tuple(offers),
     )
+
+
+def _of_fleet(fleet: Fleet, spec: RunSpec, options: Mapping[str, Any]) -> RunSpec:
+    """The spec with the predictions of a prepared fleet.
+
+    Args:
+        options: Given options; a field of `spec` that differs from its default counts as given, too.
+
+    Raises:
+        FleetError: an option contradicts the fleet.
+    """
+    for name in ("difficulty", "risk"):
+        given, prepared = getattr(spec, name), getattr(fleet, name)
+        if given != prepared and (name in options or given != getattr(RunSpec, name)):
+            raise FleetError(
+                f"This fleet is prepared with {name}='{prepared}' (got {name}='{given}'); leave the option out, or "
+                "prepare another fleet."
+            )
+        spec = replace(spec, **{name: prepared})
+    return spec
 
 
 def _with_prediction(event: Event, seen: Mapping[str, Observation], actions: Mapping[str, int]) -> Event:

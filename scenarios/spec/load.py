@@ -8,7 +8,7 @@ from inspect import Parameter, signature
 from pathlib import Path
 from typing import Any
 
-from fleet.errors import ScenarioError, nearest
+from fleet.errors import ScenarioError, nearest, printable
 from scenarios.spec.parse import override, parse_toml
 from scenarios.spec.schema import SPLITS, Scenario
 
@@ -77,7 +77,10 @@ def scenario_with(
         ScenarioError: an override is neither a field nor an option; names the nearest.
     """
     if not isinstance(scenario, str | Path | Scenario):
-        raise ScenarioError(f"scenario must be a library name, a .toml file or a Scenario (got {scenario!r}).")
+        given = printable(repr(scenario), 80)
+        if isinstance(getattr(scenario, "scenario", None), Scenario):  # a prepared fleet, or a recorded run
+            given = f"a {type(scenario).__name__}; give its .scenario"
+        raise ScenarioError(f"scenario must be a library name, a .toml file or a Scenario (got {given}).")
     chosen = scenario if isinstance(scenario, Scenario) else load(scenario)
     fields = [field.name for field in dataclasses.fields(Scenario)]
     for name in overrides:

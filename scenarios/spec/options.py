@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from agents.registry import NAMES_HELP, WRAPPERS_HELP, names_of
-from fleet.bus.exchange.channel import PERFECT, Channel
+from fleet.bus.exchange.channel import PERFECT, Channel, check_channel
 from fleet.fields import MAX_SEED, MAX_SPEED, MIN_SPEED, check, option
 
 DifficultyName = Literal["twin", "blind", "oracle"]
@@ -48,6 +48,7 @@ class RunSpec:
 
     def __post_init__(self) -> None:
         check(self)
+        check_channel(self.channel)
 
 
 DECISION_LIMIT_S = 60.0

@@ -7,7 +7,7 @@ import numpy as np
 
 from fleet.arrivals import Arrivals
 from fleet.breaks import Break
-from fleet.bus.exchange.channel import PERFECT, Channel
+from fleet.bus.exchange.channel import PERFECT, Channel, check_channel
 from fleet.engine.batch import RewardWeights
 from fleet.env.validation import Decisions
 from fleet.errors import MAX_NAME, FleetError, check_between, check_names, check_nonnegative, check_positive, nearest
@@ -369,7 +369,12 @@ class Scenario:
                 )
 
     def channel(self, given: Channel) -> Channel:
-        """The given channel between the arms; that of the scenario if the given one is perfect."""
+        """The given channel between the arms; that of the scenario if the given one is perfect.
+
+        Raises:
+            ArgumentError: it is no channel.
+        """
+        check_channel(given)
         return self.bus if given.perfect else given
 
     @property

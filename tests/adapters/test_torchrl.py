@@ -1,5 +1,7 @@
 """TorchRL takes the batch: specs, masks, seeds, resets and ends, against the batch itself."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -182,6 +184,10 @@ def test_a_batch_that_resets_by_itself_and_what_is_no_batch_are_refused(make) ->
         TorchRLEnv(make.batch(2, autoreset=True))
     with pytest.raises(ValueError, match=r"TorchRLEnv takes a batch made by scenarios\.make_batch\(\) \(got "):
         TorchRLEnv("quickstart")  # pyright: ignore[reportArgumentType]
+    wrong: Any = ({"seed": -1}, r"seed must be an integer from 0 to"), ({"joined": "x"}, "joined must be True or False")
+    for options, says in wrong:
+        with pytest.raises(ValueError, match=says):
+            TorchRLEnv(make.batch(2), **options)
 
 
 def masked(frames: TensorDict) -> TensorDict:

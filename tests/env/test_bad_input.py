@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from fleet.env import allocation_v2
-from fleet.errors import ScenarioError
+from fleet.env.adapters.gymnasium_view import DispatcherEnv, DispatcherVectorEnv
+from fleet.errors import FleetError, ScenarioError
 from scenarios.prepare.batch import make_batch
 from scenarios.prepare.fleet import Randomisation, make_env
 
 MAKERS = (make_env, lambda scenario, **options: make_batch(scenario, 2, **options))
-NO_SEEDS = (-1, 1.5, "a", True, [1, 2], np.array(3.0))
+NO_SEEDS = (-1, 2**32, 1.5, "a", True, [1, 2], np.array(3.0))
 
 
 def test_actions_may_be_numpy_integers(make, play) -> None:
@@ -47,8 +48,9 @@ def test_integers_outside_the_space_are_waits(make, action) -> None:
 def test_actions_must_be_a_dictionary(make, actions) -> None:
     env = make()
     env.reset(seed=1)
-    with pytest.raises(ValueError, match=r"step\(\) takes a dictionary of agents and their actions \(got "):
-        env.step(actions)
+    for call in (env.step, env.advance):
+        with pytest.raises(ValueError, match=r"actions must be a dictionary of agents and their actions \(got "):
+            call(actions)
 
 
 @pytest.mark.parametrize("name", ["arm_9", 0, None])
@@ -76,7 +78,7 @@ def test_errors_before_reset_and_after_the_end_name_the_call_to_make(make, play)
 
 @pytest.mark.parametrize("seed", NO_SEEDS)
 def test_invalid_seeds_are_refused(make, seed) -> None:
-    with pytest.raises(ValueError, match=r"seed must be an integer >= 0 \(got "):
+    with pytest.raises(ValueError, match=r"seed must be an integer from 0 to 4294967295 \(got "):
         make().reset(seed=seed)
 
 
@@ -85,8 +87,9 @@ def test_invalid_seeds_are_refused(make, seed) -> None:
     [
         ({"render_mode": "tv"}, r"render_mode must be one of None, 'ansi', 'rgb_array', 'human' \(got 'tv'\)\."),
         ({"mask_in": "none"}, r"mask_in must be one of 'obs', 'info', 'both' \(got 'none'\)\."),
-        ({"max_cycles": 0}, r"max_cycles must be an integer >= 1 \(got 0\)\."),
-        ({"max_cycles": 2.5}, r"max_cycles must be an integer >= 1 \(got 2\.5\)\."),
+        ({"max_cycles": 0}, r"max_cycles must be an integer from 1 to 2\*\*62 \(got 0\)\."),
+        ({"max_cycles": 10**30}, r"max_cycles must be an integer from 1 to 2\*\*62 \(got 10+\)\."),
+        ({"max_cycles": 2.5}, r"max_cycles must be an integer from 1 to 2\*\*62 \(got 2\.5\)\."),
         ({"scaled": "no"}, r"scaled must be True or False \(got 'no'\)\."),
         ({"ahead_s": -1}, r"ahead_s must be a number of seconds >= 0, or inf \(got -1\)\."),
         ({"ahead_s": float("nan")}, r"ahead_s must be a number of seconds >= 0, or inf \(got nan\)\."),
@@ -169,7 +172,7 @@ def test_batch_errors_before_reset_and_after_the_end_name_the_call_to_make(batch
     "seed", [*(each for each in NO_SEEDS if np.ndim(each) == 0), [1], [1, 2, 3], [1, -2], [1, "x"]]
 )
 def test_invalid_batch_seeds_are_refused(batch, seed) -> None:
-    message = r"seed must be (an integer >= 0|one integer or one for each of 2 envs) \(got "
+    message = r"seed must be (an integer from 0 to 4294967295|one integer or one for each of 2 envs) \(got "
     with pytest.raises(ValueError, match=message):
         batch(2, seed=seed)
     env = batch(2)
@@ -177,14 +180,26 @@ def test_invalid_batch_seeds_are_refused(batch, seed) -> None:
         env.reset(seed=seed)
 
 
-@pytest.mark.parametrize("seed", [np.uint8(255), np.array(127, dtype=np.int8), np.int64(2**63 - 1), 2**200])
+@pytest.mark.parametrize("seed", [np.uint8(255), np.array(127, dtype=np.int8), np.uint32(2**31), 2**32 - 1])
 def test_seeds_count_up_past_the_largest_integer_of_their_type(batch, play, seed) -> None:
-    counted, listed = batch(2, seed=seed), batch(2, seed=[int(seed), int(seed) + 1])
+    counted, listed = batch(2, seed=seed), batch(2, seed=[int(seed), (int(seed) + 1) % 2**32])
     for env in (counted, listed):
         env.reset()
     nobody = np.zeros((2, 3), int)
     play.same(play.rows(counted.step(nobody), range(2)), play.rows(listed.step(nobody), range(2)))
     assert counted.state.temp_c.tolist() == listed.state.temp_c.tolist()
+
+
+@pytest.mark.parametrize("options", [3, "x", [], {"horizon_s": 3}])
+def test_a_reset_refuses_options(make, batch, options) -> None:
+    dispatchers = DispatcherEnv(make()), DispatcherVectorEnv(batch(2))
+    for env in (make(), batch(2), *dispatchers):
+        with pytest.raises(
+            ValueError, match=r"options must be a dictionary or None|reset\(\) has no option 'horizon_s'"
+        ):
+            env.reset(seed=0, options=options)
+        env.reset(options={})
+        env.reset(options=None)
 
 
 @pytest.mark.parametrize("rows", [[2], [-1], 1, "x", [[0]], [0.5], np.array([True])])
@@ -201,10 +216,10 @@ def test_rows_out_of_range_or_of_wrong_shape_or_beside_a_seed_are_refused(batch,
 
 @pytest.mark.parametrize("count", [0, 2.5, None, True])
 def test_num_envs_and_max_cycles_must_be_positive(batch, count) -> None:
-    with pytest.raises(ValueError, match=r"num_envs must be an integer >= 1 \(got "):
+    with pytest.raises(ValueError, match=r"num_envs must be an integer from 1 to 2\*\*62 \(got "):
         batch(count)
     if count is not None:
-        with pytest.raises(ValueError, match=r"max_cycles must be an integer >= 1 \(got "):
+        with pytest.raises(ValueError, match=r"max_cycles must be an integer from 1 to 2\*\*62 \(got "):
             batch(2, max_cycles=count)
 
 
@@ -250,7 +265,7 @@ def test_overrides_may_be_numpy_numbers(cell, plans) -> None:
 
 def test_options_of_wrong_type_are_refused_with_the_valid_type(cell, plans) -> None:
     wrong: Any = 0.3
-    with pytest.raises(ScenarioError, match=r"channel must be a fleet\.bus\.exchange\.channel\.Channel \(got 0\.3\)"):
+    with pytest.raises(FleetError, match=r"channel must be of type Channel, for example .*Channel\(.*\) \(got 0\.3\)"):
         make_env(cell, difficulty="blind", cache=plans, channel=wrong)
     for make in MAKERS:
         with pytest.raises(ScenarioError, match=r"cache must be the path of a folder \(got 0\.3\)"):

@@ -23,7 +23,11 @@ from scenarios.prepare.fleet import Fleet, env_of, prepare
 from scenarios.run.shift import RunLog, run
 from scenarios.spec.options import RunSpec
 
-COPIES: dict[str, Callable[[Any], Any]] = {"pickle": lambda env: pickle.loads(pickle.dumps(env)), "copy": copy.deepcopy}
+COPIES: dict[str, Callable[[Any], Any]] = {
+    "pickle": lambda env: pickle.loads(pickle.dumps(env)),
+    "copy": copy.copy,
+    "deepcopy": copy.deepcopy,
+}
 WHOLE = """
 import numpy as np
 from fleet.env.allocation_v2 import env as aec_env, parallel_env
@@ -61,7 +65,9 @@ for each in results():
 LATE = Channel(loss=0.4, delay_s=20.0)
 
 
-@pytest.mark.parametrize(("seed", "keep_events", "channel"), [(0, False, None), (7, True, None), (2**40, False, LATE)])
+@pytest.mark.parametrize(
+    ("seed", "keep_events", "channel"), [(0, False, None), (7, True, None), (2**32 - 1, False, LATE)]
+)
 def test_a_seed_repeats_a_whole_episode(make, play, seed, keep_events, channel) -> None:
     arms = ("arm_0", "arm_1", "arm_2")
     env, other = (make(keep_events=keep_events, exchange=channel and Exchange(arms, channel)) for _ in range(2))

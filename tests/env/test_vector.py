@@ -167,7 +167,8 @@ def test_resetting_other_rows_keeps_delivered_messages(batch, play) -> None:
         spoilt = other.step(np.zeros((3, 3), int))[0]
     kept = {name: values[1:].copy() for name, values in kept.items()}
     spoilt["shared"][:] = spoilt["own"][:] = -1.0
-    again, _ = other.reset(rows=[0])
+    again, info = other.reset(rows=[0])
+    assert info["elapsed_s"].tolist() == [0.0, 10.0, 10.0]
     play.same({name: values[1:] for name, values in again.items()}, kept)
     known = other.knowledge()
     np.testing.assert_array_equal(known.peer_age_s[1:], one.knowledge().peer_age_s[1:])

@@ -160,7 +160,7 @@ def test_telemetry_at_the_end_of_a_step_is_what_the_policy_observes_next(fleet, 
 
 
 def test_awards_state_what_the_chosen_plan_promised(fleet, oracle):
-    events = run(oracle, spec("round_robin", 2)).events
+    events = run(oracle, spec("round_robin", 2, difficulty="oracle")).events
     ends = {event.job: event for event in events if event.kind == "finish"}
     stated = [event for event in events if event.kind == "award" and event.job in ends]
     assert stated

@@ -225,8 +225,6 @@ def test_a_forecast_needs_temperatures_time_and_a_whole_plan(hour) -> None:
         forecast(log, replace(plan, **six))
     with pytest.raises(FleetError, match="at most 168 h can be forecast"):
         forecast(log, plan, int(MOST_S / CYCLE_S) + 1)
-    with pytest.raises(ValueError, match="repetitions must be >= 1"):
-        forecast(log, plan, 0)
     path: Any = "x.csv"
     for call in (lambda: forecast(path, plan), lambda: identify(path), lambda: identify([path])):
         with pytest.raises(TypeError, match=r"A recording is needed \(got .* twin\.logs\.reader\.read\(path\) returns"):

@@ -101,7 +101,7 @@ def test_a_run_gives_a_recording_per_arm(tmp_path: Path):
     pq.write_table(telemetry_table(telemetry, ["left", "right"]), tmp_path / "telemetry.parquet")
     pq.write_table(pa.table({"kind": ["fault"]}), tmp_path / "events.parquet")
     for recordings in (read(tmp_path / "telemetry.parquet"), read_folder(tmp_path)):
-        assert [r.name for r in recordings] == ["telemetry/left", "telemetry/right"]
+        assert [r.name for r in recordings] == [f"{tmp_path.name}/telemetry/{arm}" for arm in ("left", "right")]
         for channel in READINGS:
             np.testing.assert_allclose(getattr(recordings[1], channel), numbers[channel][:, 1].astype(np.float32))
 

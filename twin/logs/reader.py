@@ -512,6 +512,7 @@ def _read(path: Path, damaged: Damaged, measured: bool) -> list[Recording]:
     if path.is_dir():
         raise LogError(str(path), None, "is a folder; a log is a file.")
     if path.suffix == ".parquet":
+        name = f"{Path(os.path.abspath(path)).parent.name}/{name}"  # the files of all runs have one name
         return [_recording(path, f"{name}/{arm}", table, damaged) for arm, table in read_arms(path).items()]
     return [_recording(path, name, read_csv(path), damaged, measured=measured)]
 

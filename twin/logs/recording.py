@@ -1,5 +1,6 @@
 """Sensor readings of one arm over time, at any rate or at a regular one, and the heat of its motors in steps."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -28,7 +29,7 @@ class Recording:
     """
 
     name: str
-    """Name of the file, and of the arm if a file holds several."""
+    """Name of the file; if a file holds several arms, folder/file/arm."""
     time_s: Array
     """Strictly increasing, [time]."""
     q: Array
@@ -85,16 +86,35 @@ class Recording:
 
 
 def check_recordings(given: object) -> None:
-    """Check that a value is one or several recordings, and not for example the path of a log.
+    """Check that a value is a list of recordings, and not for example the path of a log.
 
     Raises:
         TypeError: it is not; names how a log is read.
     """
+    if isinstance(given, Recording):
+        raise TypeError(f"A list of recordings is needed (got one, '{given.name}'); put it in brackets.")
     several = given if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
     if wrong := [each for each in several if not isinstance(each, Recording)]:
         raise TypeError(
             f"A recording is needed (got {type(wrong[0]).__name__} {str(wrong[0])[:60]!r}). "
             "twin.logs.reader.read(path) returns the recordings of a log."
+        )
+
+
+def check_log(recordings: Sequence[Recording]) -> None:
+    """Check that these are one or more recordings, each with a name of its own.
+
+    Raises:
+        TypeError: see `check_recordings`.
+        FleetError: there is none, or two have one name.
+    """
+    check_recordings(recordings)
+    if not recordings:
+        raise FleetError("At least one recording is needed (got none).")
+    if twice := sorted(name for name, count in Counter(each.name for each in recordings).items() if count > 1):
+        raise FleetError(
+            f"Names of recordings must differ; given more than once: {', '.join(twice)}. Give each recording once, and "
+            "another name with dataclasses.replace(recording, name=…)."
         )
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 
 from fleet.errors import FleetError
+from fleet.fields import MAX_SEED, check_instance, check_value
 from fleet.heat.motor import Motors, magnet_factor
 from fleet.heat.thermal import HOUSING, WINDING, temperature_steps
 from fleet.motion import Drive
@@ -178,14 +179,16 @@ def forecast(
         ambient_c: Default: that of the identification.
 
     Raises:
-        FleetError: the log has no temperatures, or less than a minute since its last gap; a motor is below the
-            ambient temperature; the plan has a gap or too few samples; there are other than seven joints; or the run is
-            longer than a week.
-        ValueError: repetitions < 1.
+        FleetError: an argument is not allowed; the log has no temperatures, or less than a minute since its last gap; a
+            motor is below the ambient temperature; the plan has a gap or too few samples; there are other than seven
+            joints; or the run is longer than a week.
     """
     check_recordings((so_far, plan))
-    if repetitions < 1:
-        raise ValueError(f"repetitions must be >= 1 (got {repetitions}).")
+    repetitions = check_value("repetitions", repetitions, int, low=1, high=1_000_000)
+    ambient_c = check_value("ambient_c", ambient_c, float, low=-40, high=60, takes_none=True)
+    seed = check_value("seed", seed, int, low=0, high=MAX_SEED)
+    if network is not None:
+        check_instance("network", network, Identified, "the result of identify()")
     vector = _parameters(network)
     ambient_c = (AMBIENT_C if network is None else network.ambient_c) if ambient_c is None else ambient_c
     motors = vector.nominal.motors

@@ -10,7 +10,6 @@ parameters (variable projection: Golub & Pereyra 1973; Jacobian in Kaufman's for
 """
 
 import hashlib
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,7 +19,8 @@ import msgspec
 import networkx as nx
 import numpy as np
 
-from fleet.errors import FleetError, IdentificationError
+from fleet.errors import ArgumentError, FleetError, IdentificationError
+from fleet.fields import check_instance, check_value
 from fleet.heat.motor import Motors, copper_loss, gen3_motors, magnet_factor, thermal_data
 from fleet.heat.thermal import (
     HOUSING,
@@ -41,7 +41,7 @@ from twin.logs.recording import (
     CurrentSource,
     HeatLog,
     Recording,
-    check_recordings,
+    check_log,
     heat_logs,
     source_of,
 )
@@ -129,8 +129,8 @@ class ParameterVector:
     """Free parameters of one arm as a vector of logarithms, with their Gaussian prior around a nominal arm."""
 
     def __init__(self, nominal: HeatModel, free: Sequence[str] = tuple(PRIOR_SD)) -> None:
-        if not free or set(free) - set(PRIOR_SD) or len(set(free)) != len(free):
-            raise ValueError(f"Free parameters must be some of {', '.join(PRIOR_SD)}, each once (got {tuple(free)}).")
+        if not isinstance(free, Sequence) or not free or set(free) - set(PRIOR_SD) or len(set(free)) != len(free):
+            raise ArgumentError(f"Free parameters must be some of {', '.join(PRIOR_SD)}, each once (got {free!r}).")
         self.nominal = nominal
         self.free = tuple(free)
         self._held = {name: nominal.value(name) for name in PRIOR_SD}
@@ -500,17 +500,22 @@ def identify(
             rooms, and motors that are cooler than the ambient temperature are refused. Differences between recordings
             are attributed to it, not to the arm.
         free: Names of `twin.thermal.identify.PRIOR_SD`; the others keep their nominal values.
+        step_s: Length of a step of the simulation.
 
     Raises:
-        IdentificationError: the recordings are insufficient: none, wrong number of joints, no temperatures, too
-            short, no motor that warms or cools, no current.
-        FleetError: see `check_ambient`.
+        IdentificationError: the recordings are insufficient: wrong number of joints, no temperatures, too short, no
+            motor that warms or cools, no current.
+        FleetError: an argument is not allowed; see `check_log` and `check_ambient`.
     """
-    check_recordings(recordings)
-    nominal = nominal or nominal_heat_model()
+    check_log(recordings)
+    check_value("arm", arm, is_name=True)
+    ambient_c = check_value("ambient_c", ambient_c, float, low=-40, high=60)
+    ambient_sd_k = check_value("ambient_sd_k", ambient_sd_k, float, low=0, high=100, takes_none=True)
+    step_s = check_value("step_s", step_s, float, low=0, high=RESIDUAL_S, above=True)
+    nominal = nominal_heat_model() if nominal is None else nominal
+    check_instance("nominal", nominal, HeatModel, "nominal_heat_model()")
+    vector = ParameterVector(nominal, free)
     sd_k = thermal_data()["spread"]["ambient_k"] if ambient_sd_k is None else ambient_sd_k
-    if sd_k < 0:
-        raise ValueError(f"ambient_sd_k must be >= 0 (got {sd_k}).")
     _check_recordings(recordings)
     if ambient_sd_k is None:
         for recording in recordings:
@@ -518,7 +523,6 @@ def identify(
     source = source_of(recordings)
     logs = [log for r in recordings for log in heat_logs(r, nominal.motors, source, step_s=step_s)]
     _check_logs(logs, nominal)
-    vector = ParameterVector(nominal, free)
     problem, x = _fit(logs, ambient_c, sd_k, vector)
     jacobian = problem.jacobian(x)
     information = np.linalg.cholesky(jacobian.T @ jacobian).T
@@ -590,7 +594,7 @@ def _rms(logs: Sequence[HeatLog], unexplained: Sequence[Array]) -> dict[str, tup
 def _hash(recordings: Sequence[Recording]) -> str:
     digest = hashlib.sha256()
     for recording in recordings:
-        digest.update(recording.name.encode())
+        digest.update("/".join(recording.name.split("/")[-2:]).encode())  # without the folder, which may be renamed
         for channel in ("time_s", *READINGS):
             if (values := getattr(recording, channel)) is not None:
                 digest.update(channel.encode() + np.ascontiguousarray(values, dtype=float).tobytes())
@@ -598,10 +602,6 @@ def _hash(recordings: Sequence[Recording]) -> str:
 
 
 def _check_recordings(recordings: Sequence[Recording]) -> None:
-    if not recordings:
-        raise IdentificationError("Identification needs at least one recording (got none).")
-    if twice := sorted(name for name, count in Counter(r.name for r in recordings).items() if count > 1):
-        raise IdentificationError(f"Names of recordings must differ; given more than once: {', '.join(twice)}.")
     for recording in recordings:
         if recording.temp_c is None:
             raise IdentificationError(

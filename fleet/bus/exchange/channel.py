@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from fleet.errors import nearest
-from fleet.fields import MAX_SEED, check, option
+from fleet.fields import MAX_SEED, check, check_instance, option
 
 if TYPE_CHECKING:  # slow to import, and the help of commands does not need it
     import numpy as np
@@ -183,6 +183,15 @@ class Channel:
         if self.topology != "random_geometric":
             del values["radius"], values["topology_seed"]
         return values
+
+
+def check_channel(value: object) -> None:
+    """Check that an argument of a function is a channel.
+
+    Raises:
+        ArgumentError: it is not.
+    """
+    check_instance("channel", value, Channel, "fleet.bus.exchange.channel.Channel(topology='star')")
 
 
 PERFECT = Channel()

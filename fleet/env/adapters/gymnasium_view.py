@@ -25,6 +25,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from fleet.env.adapters.arguments import ARM_INFOS, TEAM_INFOS, Env, Infos, arm_space, check_batch, check_env
+from fleet.env.validation import check_reset_options
 from fleet.env.vector import BatchEnv
 
 Array = np.ndarray
@@ -107,6 +108,7 @@ class DispatcherVectorEnv(VectorEnv[Observation, Array, Array]):
         self, *, seed: int | Sequence[int] | None = None, options: Infos | None = None
     ) -> tuple[Observation, Infos]:
         """Start episodes with seed + e or seed[e] in env e; only where `options["reset_mask"]` is true, if given."""
+        check_reset_options(options, "reset_mask")
         super().reset(seed=seed if isinstance(seed, int) else None)
         obs, info = self.batch.reset(seed, rows=(options or {}).get("reset_mask"))
         self._mask = obs["action_mask"]

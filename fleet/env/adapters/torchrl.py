@@ -40,6 +40,7 @@ from torchrl.envs import EnvBase
 
 from fleet.env.adapters.arguments import ARM_INFOS, TEAM_INFOS, Infos, check_batch
 from fleet.env.random_actions import pick_legal
+from fleet.env.validation import seed_of, switch
 from fleet.env.vector import BatchEnv, Obs
 
 GROUP = "arms"
@@ -71,8 +72,14 @@ class TorchRLEnv(EnvBase):
         self.batch = batch
         self.layout = batch.layout
         self.group_map = {GROUP: list(batch.agents)}
-        self._joined, self._state, self._infos = joined, state, infos
-        self._seed = seed
+        self._joined, self._state, self._infos = (
+            switch("joined", joined),
+            switch("state", state),
+            switch("infos", infos),
+        )
+        self._seed: int | None = None
+        if seed is not None:
+            self._set_seed(seed)
         self._done = torch.zeros(batch.num_envs, 1, dtype=torch.bool)
         """Envs reported to TorchRL as done."""
         self._ended = self._done
@@ -122,7 +129,10 @@ class TorchRLEnv(EnvBase):
         return actions if tensordict is None else tensordict.update(actions)
 
     def _set_seed(self, seed: int | None) -> None:
-        self._seed = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else int(seed)
+        if seed is None:
+            seed = int(np.random.SeedSequence().generate_state(1)[0])
+        seed_of(seed)
+        self._seed = int(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
         chosen = None if tensordict is None else tensordict.get("_reset", None)
