@@ -419,6 +419,8 @@ def lose_router(shift: Shift) -> None:
 
 
 def _cut(shift: Shift, group: dict[str, int], seconds: float) -> None:
+    if shift.healed:
+        return
     shift.world.split(group)
     shift.world.after(seconds * shift.rng.uniform(0.7, 1.3), shift.world.split, {})
 
