@@ -23,6 +23,7 @@ from fleet.live.book import JobBook
 from fleet.live.consensus import grants as grants_module
 from fleet.live.consensus import participant as participant_module
 from fleet.live.consensus.grants import Claimant, Granter
+from fleet.live.consensus.participant import Participant
 from fleet.live.job_rules import PastJobs, content_hash
 from fleet.live.journal import CommitPermitted, JobsAccepted, Journal, Released
 from fleet.live.leases import Timing
@@ -261,6 +262,16 @@ add_mutation(
     "minority",
     "a claim needs a majority",
     (Claimant, "__init__", lambda start: lambda self, *a, **k: (start(self, *a, **k), setattr(self, "majority", 1))[0]),
+    alone=True,
+)
+add_mutation(
+    "wait-renewed",
+    "an arm waits for the bids of its peers no longer than a window",
+    (
+        Participant,
+        "_bid",
+        lambda bid: lambda self, *times: (bid(self, *times), setattr(self, "_waiting_s", math.inf))[0],
+    ),
     alone=True,
 )
 add_mutation(
