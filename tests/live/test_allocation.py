@@ -268,6 +268,30 @@ def test_the_space_of_an_arm_lost_in_its_last_cycle_stays_taken(fleet_of, alone)
     assert fleet.status("a").state == "unfinished"
 
 
+@pytest.mark.parametrize(("outcome", "state"), [("done", "finished"), ("redo", "waiting")])
+def test_an_arm_that_lost_its_journal_in_its_last_cycle_frees_its_space_at_home(fleet_of, outcome, state):
+    """Its job stays unfinished until a person settles it; other jobs go on."""
+    fleet = fleet_of(False, excludes=always)
+    fleet.submit(job("a", 1, **LONG))
+    fleet.until(lambda: bool(fleet.begun))
+    (arm,) = fleet.away
+    fleet.world.processes[arm].kill("is killed")
+    fleet.move_home(arm)
+    fleet.until(lambda: fleet.status("a").state == "unfinished")
+    fleet.submit(job("b", 2))
+    fleet.run(3.0)
+    assert fleet.status("b").state == "waiting"
+    fleet.world.processes[arm].disk.names.clear()
+    fleet.world.processes[arm].start()
+    fleet.until(lambda: fleet.status("b").state == "finished")
+    reason = f"'{arm}' is at home and no longer has it; its last cycle may have been done."
+    assert (fleet.status("a").state, fleet.status("a").reason) == ("unfinished", reason)
+    fleet.restart()
+    settled = fleet.control(Settle("a", outcome)).job
+    assert settled is not None
+    assert settled.state == state
+
+
 @pytest.mark.parametrize("finishes", [False, True])
 def test_an_arm_that_is_online_again_after_it_was_cleared_takes_its_space_until_it_is_home(fleet_of, alone, finishes):
     """The person was wrong: the arm is still in its last cycle."""
