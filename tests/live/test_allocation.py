@@ -9,6 +9,7 @@ from functools import partial
 
 import pytest
 
+from benchmarks.simulation import machine
 from benchmarks.simulation.machine import SimulatedEstimator
 from benchmarks.simulation.participants import AUCTIONEER
 from fleet.bus.protocol import keys
@@ -18,6 +19,7 @@ from fleet.bus.protocol.auction import (
     Lease,
     LeaseEntry,
     LeaseRequest,
+    PlanQuote,
     Receipt,
     Report,
     Result,
@@ -29,6 +31,8 @@ from fleet.job import reason_to_give_up
 from fleet.live import book as book_module
 from fleet.live.auction.rounds import Assignment
 from fleet.live.leases import Timing
+from fleet.live.monitor.health import check_jobs
+from fleet.live.monitor.snapshot import FleetSnapshot
 from fleet.live.space import ANYWHERE
 from tests.live.simulated import LONG, SPEED, TIMING, SimulatedFleet, job, refused
 
@@ -470,6 +474,26 @@ def test_reports_and_leases_are_taken_only_from_the_arm_of_the_award(auctioned):
     written = len(auctioned.world.processes[AUCTIONEER].disk.names["auction"].data)
     assert send(status.arm, "report", returned, Receipt) == first
     assert len(auctioned.world.processes[AUCTIONEER].disk.names["auction"].data) - written < 500
+
+
+@pytest.mark.parametrize("proceeds", [False, True])
+def test_a_job_whose_arm_renews_its_lease_and_reports_no_cycle_makes_no_progress(auctioned, proceeds, monkeypatch):
+    monkeypatch.setattr(machine, "PlanQuote", partial(PlanQuote, duration_s=10.0))
+    auctioned.submit(job("a", 1000))
+    auctioned.until(lambda: auctioned.status("a").cycles > 3)
+    status = auctioned.status("a")
+    auctioned.stop(status.arm)
+    for count in range(20):
+        entry = LeaseEntry(status.award, "a", status.cycles + 2 + count * proceeds, "working")
+        request = LeaseRequest(status.arm, (entry,))
+        auctioned.ask(keys.asked_by("f", AUCTIONEER, "lease", status.arm), request, Lease)
+        auctioned.run(1.0)
+    reason = "" if proceeds else f"'{status.arm}' has reported no cycle of it for more than 2 min, though it renews its"
+    assert auctioned.status("a").reason.startswith(reason)
+    assert bool(auctioned.status("a").reason) == (not proceeds)
+    now = FleetSnapshot("f", (), (), {}, (auctioned.status("a"),))
+    kinds = [("warning", "no_progress", "a")] * (not proceeds)
+    assert [(each.level, each.kind, each.subject) for each in check_jobs(now)] == kinds
 
 
 def test_an_award_outlasts_a_pause_of_the_auctioneer_longer_than_a_lease(auctioned):

@@ -35,7 +35,7 @@ from fleet.live.book import JobBook
 from fleet.live.epochs import adopted
 from fleet.live.job_rules import finish_s, joined_reasons
 from fleet.live.journal import JobsAccepted, Released
-from fleet.live.leases import Timing, clear, expire, progress, renewal, send_again, unanswered, was_stopped
+from fleet.live.leases import Timing, clear, expire, no_progress, progress, renewal, send_again, unanswered, was_stopped
 from fleet.live.records import MAX_REASON, JobEntry, JobSettled, ShiftEnded, outcome_of, requested_job
 from fleet.live.space import Excludes, no_conflicts
 from fleet.live.steering import carry_out, controlled
@@ -105,6 +105,13 @@ class Auctioneer:
             lease = self.book.leases[award]
             if lease.unanswered is not None:
                 self.rounds.back_offs.end(request.arm, entry.job)
+            if (
+                entry.phase == "queued"
+                or entry.cycles > lease.cycles
+                or award not in leased
+                or self._rests(request.arm)
+            ):
+                lease.progress_s = real_s, time_s
             lease.unanswered, lease.cycles = None, max(entry.cycles, lease.cycles)
             if award not in leased:  # its arm ends the cycle in progress, which may take longer than a lease
                 lease.until_s = real_s + self._timing.counted_lease_s
@@ -267,9 +274,16 @@ class Auctioneer:
         cycles = status.cycles if lease is None else max(status.cycles, lease.cycles)
         waits = status.state == "waiting"
         note = "" if spec is None or not waits else self.rounds.reason_to_wait(spec, busy)
+        if lease is not None and status.state in ("awarded", "finishing"):
+            note = no_progress(lease, status.arm, self._timing, *self.rounds.now_s)
         planned = not waits or bool(status.arm) or self.rounds.is_planned(status.job)  # an arm had it before
         expected_s, reason = finish_s(status, self.rounds.states.get(status.arm)), joined_reasons(status.reason, note)
         return replace(status, cycles=cycles, reason=reason, finish_s=expected_s, not_planned=not planned)
+
+    def _rests(self, arm: str) -> bool:
+        """Return whether an arm is in a break, or faulted, by its last state."""
+        state = self.rounds.states.get(arm)
+        return state is not None and (state.break_in_s == 0.0 or state.mode == "faulted")
 
     def _is_open(self, entry: LeaseEntry, arm: str) -> bool:
         award = self.book.open.get(entry.award)

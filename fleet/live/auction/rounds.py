@@ -572,6 +572,7 @@ class Rounds:
         present: Arms that are present.
         obstacle: Why no job is awarded; "" if jobs are.
         back_offs: Arms that are not awarded jobs for a while.
+        now_s: Real second and fleet time of the last step.
     """
 
     def __init__(
@@ -599,7 +600,7 @@ class Rounds:
         """Real second from which a job may be offered again."""
         self._notes: dict[str, str] = {}
         """Why no arm began a job that was offered, by job."""
-        self._real_s = self._time_s = -math.inf
+        self.now_s = -math.inf, -math.inf
         self._planned: set[str] = set()
         """Waiting jobs for which arms have plans, or have said that there is none."""
         self._scan_s = self._space_s = -math.inf
@@ -608,7 +609,7 @@ class Rounds:
 
     def step(self, real_s: float, time_s: float) -> None:
         """Open or close a round if that is due."""
-        self._real_s, self._time_s = real_s, time_s
+        self.now_s = real_s, time_s
         if self.open is None:
             if real_s >= self._scan_s:
                 self._scan_s = real_s + SCAN_S
@@ -636,10 +637,10 @@ class Rounds:
         able = [arm for arm in sorted(self.present) if not book.is_paused(arm)]
         if not able:
             return "All present arms are paused."
-        left_out = {arm: self.back_offs.why_no_job(arm, self._real_s) for arm in able}
+        left_out = {arm: self.back_offs.why_no_job(arm, self.now_s[0]) for arm in able}
         if all(left_out.values()):
             return f"{', '.join(f'{arm} {why}' for arm, why in left_out.items())}."[:MAX_REASON]
-        if reason := why_not_ready(job, self._time_s, book.is_finished, busy):
+        if reason := why_not_ready(job, self.now_s[1], book.is_finished, busy):
             return reason
         most, soon = self._timing.max_jobs, "It waits to be offered in the next round."
         return self._notes.get(job.name, NOT_OFFERED.format(most) if len(book.waiting) > most else soon)
@@ -792,5 +793,8 @@ class Rounds:
             award = Award(record.award, bidding.auction, self._name, *terms, epoch=self._book.epoch)
             message = SendAward(record.arm, award)
             until_s = real_s + self._timing.counted_lease_s
-            self._book.leases[record.award] = CountedLease(until_s, unanswered=message, sent_s=real_s)
+            plan = bidding.offer(record.arm, record.job, record.plan)
+            takes_s = math.inf if plan is None or plan.duration_s is None else plan.duration_s
+            counted = CountedLease(until_s, 0, message, real_s, takes_s=takes_s, progress_s=(real_s, time_s))
+            self._book.leases[record.award] = counted
             self._send(message)
