@@ -142,20 +142,18 @@ class Auctioneer:
         if (arm, job) != (report.arm, report.job):
             raise Refused(f"Award '{report.award}' gives '{job}' to '{arm}', not '{report.job}' to '{report.arm}'.")
         if grant.outcome not in ("finished", "unfinished", "returned"):
+            spec, doubts = self.book.jobs[job].spec, list[str]()
             if report.outcome == "finished" and not grant.may_commit:
-                _LOG.error("'%s' finished '%s' without permission to commit.", arm, job)
-            spec = self.book.jobs[job].spec
+                doubts.append(f"'{arm}' finished '{job}' without permission to commit: it may have been done twice.")
             if report.outcome == "finished" and spec is not None and report.cycles != spec.repetitions:
-                _LOG.warning(
-                    "'%s' reports '%s' finished after %d cycles, but it has %d: it counts as finished.",
-                    arm,
-                    job,
-                    report.cycles,
-                    spec.repetitions,
-                )
+                counts = f"finished after {report.cycles} cycles, but it has {spec.repetitions}"
+                doubts.append(f"'{arm}' reports '{job}' {counts}: it counts as finished.")
+            for doubt in doubts:
+                _LOG.error("%s", doubt)
+            reason = joined_reasons(report.reason, " ".join(doubts))[:MAX_REASON]
             # The space of an award that has ended may have been freed since.
             space = retaken_space(self.book, arm, {grant.record.space}) if grant.outcome else []
-            shown = replace(report, time_s=min(report.time_s, time_s), reason=report.reason[:MAX_REASON])
+            shown = replace(report, time_s=min(report.time_s, time_s), reason=reason)
             self.book.record(*space, JobSettled(outcome_of(shown, {report.award: arm} if report.faulted else {})))
             if report.outcome == "finished":
                 self.rounds.retry_now()
