@@ -112,7 +112,7 @@ class Auctioneer:
                 or self._rests(request.arm)
             ):
                 lease.progress_s = real_s, time_s
-            lease.unanswered, lease.cycles = None, max(entry.cycles, lease.cycles)
+            lease.unanswered, lease.cycles = None, max(self._counted(entry), lease.cycles)
             if award not in leased:  # its arm ends the cycle in progress, which may take longer than a lease
                 lease.until_s = real_s + self._timing.counted_lease_s
         if not self._permit_commits(leased, time_s):
@@ -277,6 +277,11 @@ class Auctioneer:
         planned = not waits or bool(status.arm) or self.rounds.is_planned(status.job)  # an arm had it before
         expected_s, reason = finish_s(status, self.rounds.states.get(status.arm)), joined_reasons(status.reason, note)
         return replace(status, cycles=cycles, reason=reason, finish_s=expected_s, not_planned=not planned)
+
+    def _counted(self, entry: LeaseEntry) -> int:
+        """Return the cycles of a renewal that count: the last one counts once it is reported."""
+        spec = self.book.jobs[entry.job].spec
+        return entry.cycles if spec is None else min(entry.cycles, spec.repetitions - 1)
 
     def _rests(self, arm: str) -> bool:
         """Return whether an arm is in a break, or faulted, by its last state."""

@@ -271,6 +271,11 @@ class AuctionNode(JobDesk):
         link.declare_token(keys.of_auction(fleet, name, "alive"))
 
     def _renew_leases(self, request: LeaseRequest) -> Lease:
+        for entry in request.entries:
+            spec = None if (job := self.book.jobs.get(entry.job)) is None else job.spec
+            if spec is not None and entry.cycles > spec.repetitions:
+                counts = f"{entry.cycles} cycles of '{entry.job}', which has {spec.repetitions}"
+                self._warn(request.arm, "cycles", f"reports {counts}: only {spec.repetitions - 1} count.")
         return self.auctioneer.renew_leases(request, *self._now())
 
     def _apply_report(self, report: Report) -> Receipt:

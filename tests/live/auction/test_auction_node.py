@@ -223,6 +223,22 @@ def test_what_is_wrong_with_a_quote_is_logged_once_and_is_the_reason_of_the_job(
     assert says in logged[0]
 
 
+def test_cycles_beyond_those_of_a_job_do_not_count_and_are_logged_once(bus, caplog):
+    node = bus.auctioneer()
+    bus.arm("arm_0").commits = False
+    job = JobSpec(name="a", kind="hold", places=("rack",), repetitions=3)
+    bus.ask(keys.of_jobs("f", "submit"), Submission((job,)), SubmissionReply)
+    bus.until(lambda: node.book.open)
+    (award,) = node.book.open
+    for cycles in (50, 19):
+        request = LeaseRequest("arm_0", (LeaseEntry(award, "a", cycles, "working"),))
+        (lease,) = bus.ask(keys.asked_by("f", "auctioneer", "lease", "arm_0"), request, Lease).messages.values()
+        assert lease.granted == (award,)
+    assert node.auctioneer.status(("a",))[0].cycles == 2
+    logged = [each.getMessage() for each in caplog.records if each.getMessage().startswith("Arm 'arm_0' ")]
+    assert logged == ["Arm 'arm_0' reports 50 cycles of 'a', which has 3: only 2 count."]
+
+
 TWICE = ("Started", "Started")
 """Of the owner, which compaction keeps, and of the start."""
 
