@@ -16,6 +16,7 @@ roster (`fleet.live.consensus.grants`). The rules that make it safe (`fleet.bus.
 - After a crash every open grant counts as leased from the restart.
 - An arm takes the space of a grant until a later quote or claim of the arm states that it does not. Of two plans that
   exclude each other one is granted. An arm without such a message may be anywhere.
+- A silent grant is revoked when a later quote of its arm states that it takes no space: its job stays unfinished.
 - Whoever frees the space of an arm also revokes its grants; if the arm is online again, it takes its space again.
 
 A replay gives the same book, with the same numbers on its results. The ends of leases are not recorded.
@@ -449,6 +450,7 @@ class JobBook(TimedState[BookRecord]):
                     self._move(entry, "waiting", entry.reason)
             case SpaceTaken():
                 self.space[record.arm] = frozenset(record.space)
+                changed = self._lose(record.lost)
             case SpaceCleared(arm, by):
                 request = ControlRequest(f"clear-{record.time_s:.3f}-{arm}"[:MAX_REQUEST_NAME], Clear(arm), by)
                 self._number(Operation(self.name, record.time_s, request, epoch=self.epoch if self.is_central else ""))
@@ -700,6 +702,17 @@ class JobBook(TimedState[BookRecord]):
                     grant.outcome = "dropped"
                     changed += self._wait(entry, f"{cleared}.")
             changed += self._redo(entry) if its else []
+        return changed
+
+    def _lose(self, awards: Iterable[str]) -> list[JobEntry]:
+        """Revoke silent grants that their arm, at home, no longer has: the jobs stay unfinished until settled."""
+        changed: list[JobEntry] = []
+        for award in awards:
+            if (grant := self.open.pop(award, None)) is not None:
+                grant.revoked, entry = True, self.jobs[grant.record.job]
+                reason = f"'{grant.record.arm}' is at home and no longer has it; its last cycle may have been done."
+                self._move(entry, "unfinished", reason)
+                changed.append(entry)
         return changed
 
     def _adopt(self, record: HistoryAdopted) -> list[JobEntry]:

@@ -113,6 +113,14 @@ def reason_for_silence(arm: str) -> str:
     return f"'{arm}' was about to finish it and has not renewed its lease since."
 
 
+NO_CYCLE = "has reported no cycle of it for"
+
+
+def reason_for_no_progress(arm: str, limit_s: float) -> str:
+    """Return what is wrong with a job whose arm renews its lease, and does nothing for it."""
+    return f"'{arm}' {NO_CYCLE} more than {limit_s / 60:.0f} min, though it renews its lease."
+
+
 def reason_to_follow(before: str) -> str:
     """Return why a job is given up that waits for one that is, or that was cancelled."""
     return f"Given up, because it waits for '{before}', which is given up or cancelled."

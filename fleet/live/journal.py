@@ -361,6 +361,8 @@ class SpaceTaken(msgspec.Struct, frozen=True, tag="space_taken"):
     space: tuple[Name, ...] = ()
     """Names, without those of its open awards."""
     time_s: float = 0.0
+    lost: tuple[Name, ...] = ()
+    """Silent awards that the arm, at home, no longer has. They are revoked, as by `SpaceCleared`."""
 
 
 class SpaceCleared(msgspec.Struct, frozen=True, tag="space_cleared"):

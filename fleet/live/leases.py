@@ -7,11 +7,17 @@ from fleet.bus.protocol.auction import LEASE_S
 from fleet.errors import Refused, RefusedForNow, listed
 from fleet.live.book import JobBook
 from fleet.live.clock import CLOCK_DRIFT
+from fleet.live.job_rules import reason_for_no_progress
 from fleet.live.journal import CommitPermitted, Progress, Released, SpaceCleared
 from fleet.live.records import BookRecord, ContactLost, ContactRegained, CountedLease, SendAward
 
 STOPPED_S = 1.0
 """Real seconds after the end of a lease: a process that notices the end later was stopped meanwhile."""
+
+STALLED = 3.0
+"""Multiple of the predicted duration of a job, and of a lease, after which a job without a cycle makes no progress."""
+STALLED_S = 60.0
+"""Fleet seconds more than that."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +92,15 @@ def expire(book: JobBook, real_s: float, time_s: float) -> list[CountedLease]:
         ):
             return back
     return back
+
+
+def no_progress(lease: CountedLease, arm: str, timing: Timing, real_s: float, time_s: float) -> str:
+    """Return that an arm renews a lease and does nothing for its job; "" if it may do something."""
+    limit_s = STALLED * lease.takes_s + STALLED_S
+    since_real_s, since_s = lease.progress_s
+    if time_s - since_s > limit_s and real_s - since_real_s > STALLED * timing.lease_s:
+        return reason_for_no_progress(arm, limit_s)
+    return ""
 
 
 def was_stopped(lease: CountedLease, real_s: float) -> bool:

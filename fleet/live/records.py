@@ -434,3 +434,7 @@ class CountedLease:
     """The award, until its arm answers."""
     sent_s: float = -math.inf
     attempts: int = 1
+    takes_s: float = math.inf
+    """Predicted fleet seconds for the job; inf for unknown."""
+    progress_s: tuple[float, float] = (math.inf, math.inf)
+    """Real second and fleet time since which its arm could have done a cycle, and has not reported one."""

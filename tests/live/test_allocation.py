@@ -9,6 +9,7 @@ from functools import partial
 
 import pytest
 
+from benchmarks.simulation import machine
 from benchmarks.simulation.machine import SimulatedEstimator
 from benchmarks.simulation.participants import AUCTIONEER
 from fleet.bus.protocol import keys
@@ -18,6 +19,7 @@ from fleet.bus.protocol.auction import (
     Lease,
     LeaseEntry,
     LeaseRequest,
+    PlanQuote,
     Receipt,
     Report,
     Result,
@@ -29,6 +31,8 @@ from fleet.job import reason_to_give_up
 from fleet.live import book as book_module
 from fleet.live.auction.rounds import Assignment
 from fleet.live.leases import Timing
+from fleet.live.monitor.health import check_jobs
+from fleet.live.monitor.snapshot import FleetSnapshot
 from fleet.live.space import ANYWHERE
 from tests.live.simulated import LONG, SPEED, TIMING, SimulatedFleet, job, refused
 
@@ -268,6 +272,30 @@ def test_the_space_of_an_arm_lost_in_its_last_cycle_stays_taken(fleet_of, alone)
     assert fleet.status("a").state == "unfinished"
 
 
+@pytest.mark.parametrize(("outcome", "state"), [("done", "finished"), ("redo", "waiting")])
+def test_an_arm_that_lost_its_journal_in_its_last_cycle_frees_its_space_at_home(fleet_of, outcome, state):
+    """Its job stays unfinished until a person settles it; other jobs go on."""
+    fleet = fleet_of(False, excludes=always)
+    fleet.submit(job("a", 1, **LONG))
+    fleet.until(lambda: bool(fleet.begun))
+    (arm,) = fleet.away
+    fleet.world.processes[arm].kill("is killed")
+    fleet.move_home(arm)
+    fleet.until(lambda: fleet.status("a").state == "unfinished")
+    fleet.submit(job("b", 2))
+    fleet.run(3.0)
+    assert fleet.status("b").state == "waiting"
+    fleet.world.processes[arm].disk.names.clear()
+    fleet.world.processes[arm].start()
+    fleet.until(lambda: fleet.status("b").state == "finished")
+    reason = f"'{arm}' is at home and no longer has it; its last cycle may have been done."
+    assert (fleet.status("a").state, fleet.status("a").reason) == ("unfinished", reason)
+    fleet.restart()
+    settled = fleet.control(Settle("a", outcome)).job
+    assert settled is not None
+    assert settled.state == state
+
+
 @pytest.mark.parametrize("finishes", [False, True])
 def test_an_arm_that_is_online_again_after_it_was_cleared_takes_its_space_until_it_is_home(fleet_of, alone, finishes):
     """The person was wrong: the arm is still in its last cycle."""
@@ -446,6 +474,26 @@ def test_reports_and_leases_are_taken_only_from_the_arm_of_the_award(auctioned):
     written = len(auctioned.world.processes[AUCTIONEER].disk.names["auction"].data)
     assert send(status.arm, "report", returned, Receipt) == first
     assert len(auctioned.world.processes[AUCTIONEER].disk.names["auction"].data) - written < 500
+
+
+@pytest.mark.parametrize("proceeds", [False, True])
+def test_a_job_whose_arm_renews_its_lease_and_reports_no_cycle_makes_no_progress(auctioned, proceeds, monkeypatch):
+    monkeypatch.setattr(machine, "PlanQuote", partial(PlanQuote, duration_s=10.0))
+    auctioned.submit(job("a", 1000))
+    auctioned.until(lambda: auctioned.status("a").cycles > 3)
+    status = auctioned.status("a")
+    auctioned.stop(status.arm)
+    for count in range(20):
+        entry = LeaseEntry(status.award, "a", status.cycles + 2 + count * proceeds, "working")
+        request = LeaseRequest(status.arm, (entry,))
+        auctioned.ask(keys.asked_by("f", AUCTIONEER, "lease", status.arm), request, Lease)
+        auctioned.run(1.0)
+    reason = "" if proceeds else f"'{status.arm}' has reported no cycle of it for more than 2 min, though it renews its"
+    assert auctioned.status("a").reason.startswith(reason)
+    assert bool(auctioned.status("a").reason) == (not proceeds)
+    now = FleetSnapshot("f", (), (), {}, (auctioned.status("a"),))
+    kinds = [("warning", "no_progress", "a")] * (not proceeds)
+    assert [(each.level, each.kind, each.subject) for each in check_jobs(now)] == kinds
 
 
 def test_an_award_outlasts_a_pause_of_the_auctioneer_longer_than_a_lease(auctioned):

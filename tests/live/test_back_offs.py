@@ -156,6 +156,9 @@ def test_a_report_of_a_finished_job_with_other_cycles_is_logged_and_counts_at_mo
     assert f"'a' reports 'j' finished after {cycles} cycles, but it has 3" in caplog.text
     (status,) = shop.auctioneer.status(("j",))
     assert (status.state, status.cycles) == ("finished", counted)
+    assert status.reason.startswith(
+        "'a' finished 'j' without permission to commit: it may have been done twice. 'a' rep"
+    )
 
 
 def test_an_arm_without_a_usable_quote_is_named_with_what_is_wrong() -> None:

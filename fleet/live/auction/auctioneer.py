@@ -35,7 +35,7 @@ from fleet.live.book import JobBook
 from fleet.live.epochs import adopted
 from fleet.live.job_rules import finish_s, joined_reasons
 from fleet.live.journal import JobsAccepted, Released
-from fleet.live.leases import Timing, clear, expire, progress, renewal, send_again, unanswered, was_stopped
+from fleet.live.leases import Timing, clear, expire, no_progress, progress, renewal, send_again, unanswered, was_stopped
 from fleet.live.records import MAX_REASON, JobEntry, JobSettled, ShiftEnded, outcome_of, requested_job
 from fleet.live.space import Excludes, no_conflicts
 from fleet.live.steering import carry_out, controlled
@@ -105,7 +105,14 @@ class Auctioneer:
             lease = self.book.leases[award]
             if lease.unanswered is not None:
                 self.rounds.back_offs.end(request.arm, entry.job)
-            lease.unanswered, lease.cycles = None, max(entry.cycles, lease.cycles)
+            if (
+                entry.phase == "queued"
+                or entry.cycles > lease.cycles
+                or award not in leased
+                or self._rests(request.arm)
+            ):
+                lease.progress_s = real_s, time_s
+            lease.unanswered, lease.cycles = None, max(self._counted(entry), lease.cycles)
             if award not in leased:  # its arm ends the cycle in progress, which may take longer than a lease
                 lease.until_s = real_s + self._timing.counted_lease_s
         if not self._permit_commits(leased, time_s):
@@ -135,20 +142,18 @@ class Auctioneer:
         if (arm, job) != (report.arm, report.job):
             raise Refused(f"Award '{report.award}' gives '{job}' to '{arm}', not '{report.job}' to '{report.arm}'.")
         if grant.outcome not in ("finished", "unfinished", "returned"):
+            spec, doubts = self.book.jobs[job].spec, list[str]()
             if report.outcome == "finished" and not grant.may_commit:
-                _LOG.error("'%s' finished '%s' without permission to commit.", arm, job)
-            spec = self.book.jobs[job].spec
+                doubts.append(f"'{arm}' finished '{job}' without permission to commit: it may have been done twice.")
             if report.outcome == "finished" and spec is not None and report.cycles != spec.repetitions:
-                _LOG.warning(
-                    "'%s' reports '%s' finished after %d cycles, but it has %d: it counts as finished.",
-                    arm,
-                    job,
-                    report.cycles,
-                    spec.repetitions,
-                )
+                counts = f"finished after {report.cycles} cycles, but it has {spec.repetitions}"
+                doubts.append(f"'{arm}' reports '{job}' {counts}: it counts as finished.")
+            for doubt in doubts:
+                _LOG.error("%s", doubt)
+            reason = joined_reasons(report.reason, " ".join(doubts))[:MAX_REASON]
             # The space of an award that has ended may have been freed since.
             space = retaken_space(self.book, arm, {grant.record.space}) if grant.outcome else []
-            shown = replace(report, time_s=min(report.time_s, time_s), reason=report.reason[:MAX_REASON])
+            shown = replace(report, time_s=min(report.time_s, time_s), reason=reason)
             self.book.record(*space, JobSettled(outcome_of(shown, {report.award: arm} if report.faulted else {})))
             if report.outcome == "finished":
                 self.rounds.retry_now()
@@ -267,9 +272,21 @@ class Auctioneer:
         cycles = status.cycles if lease is None else max(status.cycles, lease.cycles)
         waits = status.state == "waiting"
         note = "" if spec is None or not waits else self.rounds.reason_to_wait(spec, busy)
+        if lease is not None and status.state in ("awarded", "finishing"):
+            note = no_progress(lease, status.arm, self._timing, *self.rounds.now_s)
         planned = not waits or bool(status.arm) or self.rounds.is_planned(status.job)  # an arm had it before
         expected_s, reason = finish_s(status, self.rounds.states.get(status.arm)), joined_reasons(status.reason, note)
         return replace(status, cycles=cycles, reason=reason, finish_s=expected_s, not_planned=not planned)
+
+    def _counted(self, entry: LeaseEntry) -> int:
+        """Return the cycles of a renewal that count: the last one counts once it is reported."""
+        spec = self.book.jobs[entry.job].spec
+        return entry.cycles if spec is None else min(entry.cycles, spec.repetitions - 1)
+
+    def _rests(self, arm: str) -> bool:
+        """Return whether an arm is in a break, or faulted, by its last state."""
+        state = self.rounds.states.get(arm)
+        return state is not None and (state.break_in_s == 0.0 or state.mode == "faulted")
 
     def _is_open(self, entry: LeaseEntry, arm: str) -> bool:
         award = self.book.open.get(entry.award)

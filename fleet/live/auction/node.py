@@ -31,9 +31,9 @@ from fleet.bus.protocol.consensus import History, HistoryRequest
 from fleet.bus.protocol.keys import SESSION_LEASE_S
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
-from fleet.errors import BusError, JournalError, JournalFull, RefusedForNow
+from fleet.errors import BusError, JournalError, JournalFull, Refused, RefusedForNow
 from fleet.live.auction.auctioneer import Auctioneer
-from fleet.live.auction.rounds import SCAN_S, Allocate
+from fleet.live.auction.rounds import MOST_UNANSWERED, SCAN_S, Allocate
 from fleet.live.book import JobBook
 from fleet.live.clock import FleetClock
 from fleet.live.desk import JobDesk
@@ -101,7 +101,8 @@ class EpochCheck:
         book = self._auctioneer.book
         if history.epoch not in ("", book.epoch) and not book.succeeds:
             self._foreign[history.arm] = (
-                f"No jobs are accepted: the journal has the epoch '{book.epoch}', but {describe(history)}. {REMEDY}"
+                f"No jobs are accepted: the journal has the epoch '{book.epoch}', but {describe(history)}. {REMEDY} "
+                f"Or stop '{history.arm}', if it alone is wrong."
             )
             _LOG.error("%s", self._foreign[history.arm])
             return False
@@ -197,6 +198,8 @@ class AuctionNode(JobDesk):
         """Real second of the last state of each arm."""
         self._warnings: dict[str, RateLimitedWarnings] = {}
         """By arm with a token."""
+        self._late: dict[str, int] = {}
+        """Number of rounds in a row in which an arm has not quoted in time, by arm with a token."""
         self._declare()
 
     @property
@@ -264,17 +267,26 @@ class AuctionNode(JobDesk):
         self._operation = link.publisher(keys.of_auction(fleet, name, "operation"), Operation)
         self._declare_desk(link)
         link.reply_to(keys.asked_by_every_arm(fleet, name, "lease"), LeaseRequest, self._logged(self._renew_leases))
-        link.reply_to(keys.asked_by_every_arm(fleet, name, "report"), Report, self._logged(self._apply_report))
+        link.reply_to(keys.asked_by_every_arm(fleet, name, "report"), Report, self._apply_report)
         link.subscribe(keys.of_every_arm(fleet, "state"), State, self._apply_state)
         link.watch_tokens(keys.of_every_arm(fleet, "alive"), self._apply_token)
         link.watch_tokens(keys.of_every_auction(fleet, "alive"), self._apply_rival_token)
         link.declare_token(keys.of_auction(fleet, name, "alive"))
 
     def _renew_leases(self, request: LeaseRequest) -> Lease:
+        for entry in request.entries:
+            spec = None if (job := self.book.jobs.get(entry.job)) is None else job.spec
+            if spec is not None and entry.cycles > spec.repetitions:
+                counts = f"{entry.cycles} cycles of '{entry.job}', which has {spec.repetitions}"
+                self._warn(request.arm, "cycles", f"reports {counts}: only {spec.repetitions - 1} count.")
         return self.auctioneer.renew_leases(request, *self._now())
 
     def _apply_report(self, report: Report) -> Receipt:
-        return self.auctioneer.apply_report(report, *self._now())
+        try:
+            return self.auctioneer.apply_report(report, *self._now())
+        except Refused as error:
+            self._warn(report.arm, "report", f"reports in vain: {error}")
+            raise
 
     def _check_first(self) -> None:
         """Reply always: an auctioneer finds another one by its replies."""
@@ -302,7 +314,12 @@ class AuctionNode(JobDesk):
         return self._epochs.objection
 
     def _left_out(self) -> Mapping[str, str]:
-        return self.auctioneer.rounds.back_offs.unanswering
+        late = {
+            arm: f"has not quoted within {self._timing.window_s:g} s in the last {count} rounds"
+            for arm, count in self._late.items()
+            if count >= MOST_UNANSWERED
+        }
+        return {**late, **self.auctioneer.rounds.back_offs.unanswering}
 
     def _submit(self, submission: Submission) -> SubmissionReply:
         self._check_alone("no jobs are accepted")
@@ -335,6 +352,7 @@ class AuctionNode(JobDesk):
         if not present:
             self._state_s.pop(arm, None)
             self._warnings.pop(arm, None)
+            self._late.pop(arm, None)
             self._epochs.forget(arm)
             self.auctioneer.rounds.back_offs.forget(arm)
 
@@ -409,7 +427,9 @@ class AuctionNode(JobDesk):
         while out:
             match out.popleft():
                 case QuoteRequest() as request:
-                    key, done = keys.of_every_arm(fleet, "quote"), partial(self._end_quotes, request.auction)
+                    current = self.auctioneer.rounds.open
+                    asked = frozenset[str]() if current is None else current.asked
+                    key, done = keys.of_every_arm(fleet, "quote"), partial(self._end_quotes, request.auction, asked)
                     window_s, add = self._timing.window_s, partial(self._add_quote, request)
                     self._link.query(key, request, Quote, done, timeout_s=window_s, each=add)
                 case SendAward(arm, award):
@@ -422,7 +442,12 @@ class AuctionNode(JobDesk):
                 case Operation() as operation:
                     self._operation(operation)
 
-    def _end_quotes(self, auction: str, replies: Replies[Quote]) -> None:
+    def _end_quotes(self, auction: str, asked: frozenset[str], replies: Replies[Quote]) -> None:
+        replied = {quote.arm for quote in replies.messages.values()} | {_arm_of(key) for key in replies.refused}
+        self._late = {arm: count for arm, count in self._late.items() if arm not in replied}
+        for arm in sorted((asked & self.present) - replied):
+            self._late[arm] = self._late.get(arm, 0) + 1
+            self._warn(arm, "late", f"has not quoted within {self._timing.window_s:g} s: it is awarded no job.")
         for key, reason in replies.refused.items():
             if reason and (arm := _arm_of(key)):
                 self._note_unusable_quote(auction, arm, "invalid", f"gave no valid quote: {reason.rstrip('.')}")
@@ -450,6 +475,8 @@ class AuctionNode(JobDesk):
 
     def _apply_acks(self, replies: Replies[Ack]) -> None:
         for ack in replies.messages.values():
+            if not ack.accepted:
+                self._warn(ack.arm, "refused", f"refuses award '{ack.award}': {ack.reason.rstrip('.') or 'no reason'}.")
             try:
                 self.auctioneer.apply_ack(ack, *self._now())
             except JournalFull as error:  # the award is sent again, and answered again

@@ -456,6 +456,8 @@ class Round:
     quotes: dict[str, Quote] = field(default_factory=dict[str, Quote])
     unusable: dict[str, str] = field(default_factory=dict[str, str])
     """What is wrong with the replies of arms without a usable quote, by arm."""
+    silent: frozenset[str] = frozenset()
+    """Awards that were silent when the round was opened."""
 
     def complete(self, present: frozenset[str]) -> bool:
         """Return whether every arm that was asked and is still present has answered."""
@@ -506,6 +508,11 @@ def closed_space(book: JobBook) -> Mapping[str, frozenset[str]]:
     return {arm: names - still_open.get(arm, set()) for arm, names in book.space.items()}
 
 
+def silent_awards(book: JobBook) -> frozenset[str]:
+    """Return the awards in their last cycle whose arms have not renewed the lease."""
+    return frozenset(award for award, grant in book.open.items() if grant.silent)
+
+
 def retaken_space(book: JobBook, arm: str, space: Set[str]) -> list[SpaceTaken]:
     """Return what changes when an arm takes this space; it counts as free after a person has freed it.
 
@@ -528,15 +535,19 @@ def _stated_space(quote: Quote) -> frozenset[str]:
 def stated_spaces(book: JobBook, closing: Round, time_s: float) -> list[SpaceTaken]:
     """Return what the quotes of a round change in the space that arms take.
 
-    A quote says nothing about awards that were closed after the round was opened: these keep their space.
+    A quote says nothing about awards that were closed after the round was opened: these keep their space. An arm that
+    takes no space has no job: it has lost the awards that were silent before, for example without a journal.
     """
     records: list[SpaceTaken] = []
     for arm, quote in sorted(closing.quotes.items()):
         before = book.space.get(arm, frozenset())
-        open_space = {grant.record.space for grant in book.open.values() if grant.record.arm == arm}
+        grants = {award: grant for award, grant in book.open.items() if grant.record.arm == arm}
+        silent = {award for award in grants.keys() & closing.silent if grants[award].silent}
+        lost = silent if quote.space == () else set[str]()
+        open_space = {grant.record.space for award, grant in grants.items() if award not in lost}
         after = (before - closing.space.get(arm, frozenset())) | (_stated_space(quote) - open_space)
-        if after != before:
-            records.append(SpaceTaken(arm, tuple(sorted(after)), time_s))
+        if after != before or lost:
+            records.append(SpaceTaken(arm, tuple(sorted(after)), time_s, tuple(sorted(lost))))
     return records
 
 
@@ -561,6 +572,7 @@ class Rounds:
         present: Arms that are present.
         obstacle: Why no job is awarded; "" if jobs are.
         back_offs: Arms that are not awarded jobs for a while.
+        now_s: Real second and fleet time of the last step.
     """
 
     def __init__(
@@ -588,7 +600,7 @@ class Rounds:
         """Real second from which a job may be offered again."""
         self._notes: dict[str, str] = {}
         """Why no arm began a job that was offered, by job."""
-        self._real_s = self._time_s = -math.inf
+        self.now_s = -math.inf, -math.inf
         self._planned: set[str] = set()
         """Waiting jobs for which arms have plans, or have said that there is none."""
         self._scan_s = self._space_s = -math.inf
@@ -597,7 +609,7 @@ class Rounds:
 
     def step(self, real_s: float, time_s: float) -> None:
         """Open or close a round if that is due."""
-        self._real_s, self._time_s = real_s, time_s
+        self.now_s = real_s, time_s
         if self.open is None:
             if real_s >= self._scan_s:
                 self._scan_s = real_s + SCAN_S
@@ -625,10 +637,10 @@ class Rounds:
         able = [arm for arm in sorted(self.present) if not book.is_paused(arm)]
         if not able:
             return "All present arms are paused."
-        left_out = {arm: self.back_offs.why_no_job(arm, self._real_s) for arm in able}
+        left_out = {arm: self.back_offs.why_no_job(arm, self.now_s[0]) for arm in able}
         if all(left_out.values()):
             return f"{', '.join(f'{arm} {why}' for arm, why in left_out.items())}."[:MAX_REASON]
-        if reason := why_not_ready(job, self._time_s, book.is_finished, busy):
+        if reason := why_not_ready(job, self.now_s[1], book.is_finished, busy):
             return reason
         most, soon = self._timing.max_jobs, "It waits to be offered in the next round."
         return self._notes.get(job.name, NOT_OFFERED.format(most) if len(book.waiting) > most else soon)
@@ -676,17 +688,20 @@ class Rounds:
         """Open a round; return its name."""
         self._count += 1
         auction = f"{self._name}-{self._boot}-{self._count}"
-        self.open = Round(auction, jobs, asked, real_s + self._timing.window_s, closed_space(self._book))
+        closed, silent = closed_space(self._book), silent_awards(self._book)
+        self.open = Round(auction, jobs, asked, real_s + self._timing.window_s, closed, silent=silent)
         return auction
 
     def _ask_for_space(self, real_s: float) -> None:
-        """Open a round without jobs for present arms that may still take space for closed awards.
+        """Open a round without jobs for present arms that may still take space for closed or silent awards.
 
         Otherwise the space of an arm without a next job would stay closed, also when the arm has left. Only a quote
         frees it: a state may have been sent before the award. The quote is a dry run of the last job that was changed.
         """
         book = self._book
-        takes_space = frozenset(arm for arm, names in closed_space(book).items() if names) & self.present
+        closed = {arm for arm, names in closed_space(book).items() if names}
+        silent = {book.open[award].record.arm for award in silent_awards(book)}
+        takes_space = frozenset(closed | silent) & self.present
         if not takes_space or real_s < self._space_s:
             return
         last = book.jobs.get(book.recent[-1].status.job) if book.recent else None
@@ -699,7 +714,7 @@ class Rounds:
     def _close(self, closing: Round, real_s: float, time_s: float) -> None:
         self.open = None
         spaces, before = stated_spaces(self._book, closing, time_s), self._book.space
-        freed = any(frozenset(each.space) < before.get(each.arm, frozenset()) for each in spaces)
+        freed = any(each.lost or frozenset(each.space) < before.get(each.arm, frozenset()) for each in spaces)
         if not self._book.try_to_record("Nothing is awarded", *spaces):
             self.delay(real_s, (job.name for job in closing.jobs))
             return
@@ -778,5 +793,8 @@ class Rounds:
             award = Award(record.award, bidding.auction, self._name, *terms, epoch=self._book.epoch)
             message = SendAward(record.arm, award)
             until_s = real_s + self._timing.counted_lease_s
-            self._book.leases[record.award] = CountedLease(until_s, unanswered=message, sent_s=real_s)
+            plan = bidding.offer(record.arm, record.job, record.plan)
+            takes_s = math.inf if plan is None or plan.duration_s is None else plan.duration_s
+            counted = CountedLease(until_s, 0, message, real_s, takes_s=takes_s, progress_s=(real_s, time_s))
+            self._book.leases[record.award] = counted
             self._send(message)

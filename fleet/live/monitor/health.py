@@ -14,6 +14,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.operator import ALL_ARMS, by_whom
 from fleet.bus.security.tls import UNKNOWN_CERTIFICATE
 from fleet.live.clock import FleetClock
+from fleet.live.job_rules import NO_CYCLE
 from fleet.live.monitor.snapshot import FRESH_S, SILENT_S, ArmSnapshot, FleetSnapshot
 
 REASONS = {
@@ -247,7 +248,7 @@ def check_awards(fleet: FleetSnapshot) -> list[Finding]:
 
 
 def check_jobs(fleet: FleetSnapshot) -> list[Finding]:
-    """Check that no job is unfinished or abandoned, except by the end of the shift.
+    """Check that no job is unfinished or abandoned, except by the end of the shift, and that each one in work proceeds.
 
     An abandoned job whose alarm somebody has acknowledged is only noted.
     """
@@ -262,6 +263,9 @@ def check_jobs(fleet: FleetSnapshot) -> list[Finding]:
             by = seen_by.get(job.job, "")
             what = f"'{job.job}' is abandoned{f', as {by} has acknowledged' if by else ''}: {why}"
             findings.append(Finding("note" if by else "warning", what, "given_up", job.job))
+        elif job.state in ("awarded", "finishing") and NO_CYCLE in why:
+            what = f"'{job.job}' makes no progress: {why}"
+            findings.append(Finding("warning", what, "no_progress", job.job))
     return findings
 
 

@@ -223,6 +223,60 @@ def test_what_is_wrong_with_a_quote_is_logged_once_and_is_the_reason_of_the_job(
     assert says in logged[0]
 
 
+def test_cycles_beyond_those_of_a_job_do_not_count_and_are_logged_once(bus, caplog):
+    node = bus.auctioneer()
+    bus.arm("arm_0").commits = False
+    job = JobSpec(name="a", kind="hold", places=("rack",), repetitions=3)
+    bus.ask(keys.of_jobs("f", "submit"), Submission((job,)), SubmissionReply)
+    bus.until(lambda: node.book.open)
+    (award,) = node.book.open
+    for cycles in (50, 19):
+        request = LeaseRequest("arm_0", (LeaseEntry(award, "a", cycles, "working"),))
+        (lease,) = bus.ask(keys.asked_by("f", "auctioneer", "lease", "arm_0"), request, Lease).messages.values()
+        assert lease.granted == (award,)
+    assert node.auctioneer.status(("a",))[0].cycles == 2
+    assert warnings_of(caplog) == ["Arm 'arm_0' reports 50 cycles of 'a', which has 3: only 2 count."]
+
+
+def warnings_of(caplog):
+    return [each.getMessage() for each in caplog.records if each.getMessage().startswith("Arm 'arm_0' ")]
+
+
+def test_a_refused_award_is_logged_with_its_reason(bus, caplog, monkeypatch):
+    monkeypatch.setattr(Arm, "answer_award", lambda self, award: Ack(self.name, award.award, False, "Too windy."))
+    node = bus.auctioneer()
+    bus.arm("arm_0")
+    submit(bus, "a")
+    bus.until(lambda: "has refused it" in node.auctioneer.status(("a",))[0].reason)
+    (award,) = node.book.jobs["a"].grants
+    assert warnings_of(caplog) == [f"Arm 'arm_0' refuses award '{award}': Too windy."]
+
+
+def test_an_arm_that_does_not_quote_in_time_is_logged_and_named_in_the_status(bus, caplog, monkeypatch):
+    node = bus.auctioneer()
+    link = bus.stack.enter_context(BusClient(bus.endpoint, "f"))
+    reply_to = link.reply_to
+    monkeypatch.setattr(link, "reply_to", lambda key, *more: key.endswith("/quote") or reply_to(key, *more))
+    bus.arms.append(Arm(link, "arm_0"))
+    submit(bus, "a")
+    bus.until(lambda: "has not quoted within 0.5 s in the last 3 rounds" in node._left_out().get("arm_0", ""))
+    assert warnings_of(caplog) == ["Arm 'arm_0' has not quoted within 0.5 s: it is awarded no job."]
+
+
+def test_a_report_that_is_refused_again_and_again_is_logged_once(bus, caplog):
+    node = bus.auctioneer()
+    bus.arm("arm_0").commits = False
+    submit(bus, "a")
+    bus.until(lambda: node.book.open)
+    (award,) = node.book.open
+    for _ in range(3):
+        report = Report("arm_0", award, "b", "finished", 1, 0.0)
+        key = keys.asked_by("f", "auctioneer", "report", "arm_0")
+        assert bus.ask(key, report, Receipt).refusals
+    (logged,) = (each.getMessage() for each in caplog.records if f"Award '{award}'" in each.getMessage())
+    assert logged.startswith("Arm 'arm_0' reports in vain: Award")
+
+
 TWICE = ("Started", "Started")
 """Of the owner, which compaction keeps, and of the start."""
 
@@ -419,6 +473,7 @@ def test_jobs_are_refused_when_arms_of_an_older_epoch_come_later(bus):
     (reason,) = bus.ask(key, Submission(bus.jobs("a")), SubmissionReply).refused.values()
     assert "the journal has the epoch" in reason
     assert "--new-epoch" in reason
+    assert reason.endswith("Or stop 'arm_0', if it alone is wrong.")
     assert second._epochs.admitted(["arm_0"]) == frozenset()
 
 
