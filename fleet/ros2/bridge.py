@@ -289,7 +289,7 @@ class Follower:
                 for sentence in self._readings.sensors.bad.values():
                     self._warn(f"sensor of {sentence[:7]}", f"has an impossible temperature: {sentence}.")
         except MalformedMessage as error:
-            self._link.reject(f"of {topic.name}: {error}")
+            self._link.reject(f"of {topic.name}", error)
 
     def _send_state(self, now_s: float) -> None:
         self._tick += 1

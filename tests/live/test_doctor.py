@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.bus.client import BusClient
+from fleet.bus.client import BusClient, under
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Clock, ClockRequest, JobStatus
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Alarm
 from fleet.bus.router import Router
-from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_fleet, check_health, check_progress
+from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_arm, check_fleet, check_health, check_progress
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, AuctioneerSnapshot, FleetSnapshot
 from scenarios.show.watch import space_line
 from tests import commands
@@ -204,7 +204,7 @@ def test_a_fleet_that_needs_no_auctioneer_is_healthy_without_one():
 
 
 def test_malformed_messages_are_a_fault_with_each_reason_once():
-    output, _ = faults(fleet(arm()), malformed=3, complaints=["no JSON.", "no State.", "no JSON."])
+    output, _ = faults(fleet(arm()), malformed=3, complaints={"a": "no JSON.", "b": "no State.", "c": "no JSON."})
     assert output == ["3 malformed message(s), the last: no JSON.; no State."]
 
 
@@ -217,9 +217,23 @@ def test_malformed_messages_are_a_fault_with_each_reason_once():
 )
 def test_an_arm_whose_states_are_malformed_is_not_said_to_hang(age_s, says):
     now = fleet(arm(), arm(arm="b", present=False, state_age_s=age_s, time_s=None))
-    complaint = f"under '{keys.of_arm(now.fleet, 'b', 'state')}': Not a thermofleet.State.v4: no JSON."
-    output, _ = faults(now, malformed=1, complaints=[complaint])
+    place = under(keys.of_arm(now.fleet, "b", "state"))
+    output, _ = faults(now, malformed=1, complaints={place: f"{place}: Not a thermofleet.State.v4: no JSON."})
     assert says in output
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"token": False, "state_age_s": 0.5}, "it publishes its state but shows no token"),
+        ({"token": False, "state_age_s": 3.5}, "it has left, or its process hangs or has ended."),
+        ({"state_age_s": 5.0, "state_gap_s": 10.0}, "its last two states came 10.0 s apart"),
+        ({"state_age_s": 5.0, "state_gap_s": 0.1}, "it has left, or its process hangs or has ended."),
+    ],
+)
+def test_the_alarm_of_an_absent_arm_names_its_cause(change, why):
+    (finding,) = check_arm(arm(present=False, **change), None)
+    assert finding.lasting.startswith(f"a is absent: {why}")
 
 
 def test_an_arm_that_answers_no_awards_is_named():

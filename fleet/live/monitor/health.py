@@ -10,6 +10,7 @@ from typing import Literal, get_args
 
 import msgspec
 
+from fleet.bus.client import under
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.operator import ALL_ARMS, by_whom
 from fleet.bus.security.tls import UNKNOWN_CERTIFICATE
@@ -107,7 +108,7 @@ def check_health(
     probes: Sequence[ClockProbe],
     *,
     malformed: int = 0,
-    complaints: Sequence[str] = (),
+    complaints: Mapping[str, str] = NO_COMPLAINTS,
     overrun: int = 0,
     auctioneer: bool = True,
     secure: bool = False,
@@ -119,7 +120,7 @@ def check_health(
 
     Args:
         fleet: Snapshot at the real second `now_s`.
-        complaints: Reasons why the last malformed messages were dropped.
+        complaints: Why the last malformed message at each place was dropped, as `BusClient.complaints`.
         overrun: Messages lost because the queue was full.
         auctioneer: Whether the fleet should have one.
         secure: Whether the listener used a certificate; one that the router does not know receives nothing.
@@ -154,7 +155,7 @@ def check_health(
     if trips_s and median(trips_s) > SLOW_S:
         findings.append(Finding("warning", f"The router is slow: a round trip takes {1000 * median(trips_s):.0f} ms."))
     if malformed:
-        reasons = "; ".join(dict.fromkeys(complaints))  # each reason once
+        reasons = "; ".join(list(dict.fromkeys(complaints.values()))[-MOST_REASONS:])  # each reason once
         findings.append(Finding("fault", f"{malformed} malformed message(s), the last: {reasons}"))
     if overrun:
         findings.append(
@@ -346,12 +347,10 @@ def check_auctioneers(fleet: FleetSnapshot, probes: Sequence[ClockProbe], wanted
     return [Finding("fault", problem)]
 
 
-def complaints_of_states(fleet: FleetSnapshot, complaints: Sequence[str]) -> dict[str, str]:
+def complaints_of_states(fleet: FleetSnapshot, complaints: Mapping[str, str]) -> dict[str, str]:
     """The last complaint about a state of each arm, without the key that it names."""
-    names = {f"under '{keys.of_arm(fleet.fleet, arm.arm, 'state')}': ": arm.arm for arm in fleet.arms}
-    return {
-        arm: complaint.partition(key)[2] for complaint in complaints for key, arm in names.items() if key in complaint
-    }
+    places = {arm.arm: under(keys.of_arm(fleet.fleet, arm.arm, "state")) for arm in fleet.arms}
+    return {arm: complaints[place].removeprefix(f"{place}: ") for arm, place in places.items() if place in complaints}
 
 
 def check_arm(arm: ArmSnapshot, offset_s: float | None, *, malformed: str = "") -> list[Finding]:
@@ -363,14 +362,20 @@ def check_arm(arm: ArmSnapshot, offset_s: float | None, *, malformed: str = "") 
     age_s = arm.state_age_s
     if not arm.token and age_s is None:
         return [Finding("warning", f"{arm.arm} has left: it has no token, but some of its messages are still cached.")]
-    problem, cause = "", "its states are malformed." if malformed else "its process may hang."
+    problem, cause = "", "its process may hang."
+    why = "it has left, or its process hangs or has ended."
+    if malformed:
+        cause, why = "its states are malformed.", f"its states are malformed: {malformed}"
+    elif arm.token and arm.state_gap_s is not None and arm.state_gap_s > FRESH_S:
+        why = cause = f"its last two states came {arm.state_gap_s:.1f} s apart, and at least two a second are needed."
     if not arm.token:
         problem = "publishes its state but shows no token: it left, or another process uses its name."
     elif age_s is None:
         problem = f"shows its token but publishes no {'valid ' if malformed else ''}state: {cause}"
     elif age_s > FRESH_S:
         problem = f"is stale, with a last state {age_s:.1f} s old: {cause}"
-    why = f"its states are malformed: {malformed}" if malformed else "it has left, or its process hangs or has ended."
+    if not arm.token and age_s is not None and age_s <= FRESH_S:
+        why = f"it {problem}"
     absent = f"{arm.arm} is absent: {why}"
     findings = [Finding("fault", f"{arm.arm} {problem}", "absent", arm.arm, lasting=absent)] if problem else []
     if arm.doubled:

@@ -144,6 +144,8 @@ class ArmSnapshot(msgspec.Struct, frozen=True):
     """Its last event."""
     state_age_s: float | None = None
     """Since it arrived."""
+    state_gap_s: float | None = None
+    """Between the arrivals of its last two states."""
     difficulty_age_s: float | None = None
     """Since it was sent, by the arm's clock; since it arrived while the fleet's speed is unknown."""
 
@@ -208,10 +210,13 @@ class _Arm:
     events: Counter[str] = field(default_factory=Counter[str])
     starts_s: deque[float] = field(default_factory=lambda: deque[float](maxlen=MOST_STARTS + 1))
     """Real seconds of the last states with a lower tick than the one before."""
+    gap_s: float | None = None
+    """Real seconds between its last two states."""
 
     def follow(self, state: State, now_s: float) -> None:
         """Add the time since the last state to the work and heat of the arm."""
-        before, _ = self.last(State)
+        before, before_s = self.last(State)
+        self.gap_s = None if before is None else now_s - before_s
         if before is not None and state.tick < before.tick:
             self.starts_s.append(now_s)
         passed_s = 0.0 if before is None else state.time_s - before.time_s
@@ -624,5 +629,6 @@ def _arm_snapshot(name: str, arm: _Arm, now_s: float, speed: float | None, ended
         twin=info.twin if info else "",
         event=describe_event(event) if event else "",
         state_age_s=age_s,
+        state_gap_s=arm.gap_s,
         difficulty_age_s=difficulty_age_s,
     )

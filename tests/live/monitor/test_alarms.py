@@ -198,6 +198,15 @@ def test_two_processes_under_the_name_of_one_arm_are_noticed(ticks, doubled):
     assert not view.snapshot(9.0).arms[0].doubled
 
 
+def test_the_time_between_the_last_two_states_is_known():
+    view = FleetView("f")
+    gaps_s = []
+    for second in (0.0, 10.0, 10.1):
+        view.update("a", state(), second)
+        gaps_s.append(view.snapshot(second).arms[0].state_gap_s)
+    assert gaps_s == [None, 10.0, pytest.approx(0.1)]
+
+
 def test_work_and_heat_are_sums_over_the_time_between_states():
     """By hand: 10 s at work with torques 3 and 4 Nm, then 5 s idle with 2 Nm: 10 s of work, 10 · 25 + 5 · 4 N²m²s."""
     view = FleetView("f")
