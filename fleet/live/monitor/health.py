@@ -393,9 +393,10 @@ def check_arm(arm: ArmSnapshot, offset_s: float | None, *, malformed: str = "") 
         wrong = f"{arm.arm} has impossible temperatures: {arm.bad_sensor}."
         findings.append(Finding("warning", wrong, "sensor", arm.arm))
     if offset_s is not None and abs(offset_s) > OFFSET_S:
-        way = "ahead of fleet time: it does not set its clock by the replies to clock/now."
+        unset = "it does not set its clock by the replies to clock/now"
+        way = f"ahead of fleet time: {unset}."
         if offset_s < 0:
-            way = "behind fleet time: its machine may be overloaded, or its process hang."
+            way = f"behind fleet time: {unset}, or its machine may be overloaded, or its process hang."
         findings.append(Finding("fault", f"{arm.arm} is {abs(offset_s):.1f} real seconds {way}"))
     return findings
 
