@@ -542,7 +542,7 @@ def why_idle(arm: ArmSnapshot, waiting: Mapping[str, str], fleet: FleetSnapshot,
 
     Args:
         waiting: Reasons of the waiting jobs, by job.
-        fleet: Which arms are paused or left out.
+        fleet: Which arms are paused, left out or take space.
         unserved: Why no arm gets a job.
     """
     if not arm.present or arm.job:
@@ -563,7 +563,9 @@ def why_idle(arm: ArmSnapshot, waiting: Mapping[str, str], fleet: FleetSnapshot,
         return "No job waits."
     named = next((f" {job}: {reason}" for job, reason in waiting.items() if arm.arm in reason), "")
     able = sum(job in waiting and score != JobScore() for job, score in arm.scores.items())
-    return f"It has bids for {able} of {len(waiting)} waiting jobs.{named}"
+    others = ", ".join(sorted(fleet.space.keys() - {arm.arm}))
+    in_way = f" Space is closed by {others}, which may be in its way." if others else ""
+    return f"It has bids for {able} of {len(waiting)} waiting jobs.{in_way}{named}"
 
 
 def _age_s(at_s: float | None, now_s: float) -> float | None:

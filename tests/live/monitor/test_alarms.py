@@ -178,6 +178,19 @@ def test_an_arm_without_a_job_says_why(change, waiting, paused, says):
     assert bool(arm.idle) == bool(says)
 
 
+def test_an_idle_arm_names_the_arms_that_may_be_in_its_way():
+    view = FleetView("f")
+    view.set_token("arm", "a", True)
+    view.update("a", state(), 0.0)
+    reply = Status("au", 1.0, (JobStatus("j", "waiting"),))
+    for space, says in (
+        ({"a": ("s",)}, ""),
+        ({"b": ("t",), "c": ("*",)}, "Space is closed by b, c, which may be in its way."),
+    ):
+        view.update_jobs(msgspec.structs.replace(reply, space=space), 0.0)
+        assert view.snapshot(0.0).arms[0].idle == f"It has bids for 0 of 1 waiting jobs. {says}".strip()
+
+
 @pytest.mark.parametrize(
     ("ticks", "doubled"),
     [
