@@ -236,6 +236,23 @@ def test_the_alarm_of_an_absent_arm_names_its_cause(change, why):
     assert finding.lasting.startswith(f"a is absent: {why}")
 
 
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"joints": 7, "temp_c": (30.0,) * 6}, "a has 6 temperatures in its state, but 7 joints in its info."),
+        ({"joints": 7, "temp_c": (30.0,) * 7, "hottest_c": 30.0, "headroom_k": 30.0}, ""),
+        ({"joints": 7}, ""),  # it has no thermometers
+        (
+            {"hottest_c": 30.6, "headroom_k": 500.0},
+            "a reports a headroom of 500.0 K at 30.6 °C: its warning limit would",
+        ),
+    ],
+)
+def test_a_state_that_contradicts_itself_is_a_warning(change, what):
+    findings = check_arm(arm(**change), None)
+    assert [(each.level, each.what[: len(what)]) for each in findings] == [("warning", what)] * bool(what)
+
+
 def test_an_arm_that_answers_no_awards_is_named():
     left_out = {"b": "has not answered the last 3 awards"}
     _, found = faults(msgspec.structs.replace(fleet(arm(), arm(arm="b")), left_out=left_out))

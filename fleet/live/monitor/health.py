@@ -36,6 +36,8 @@ EXPECTED = ("release", "predecessor", "paused", "queue", "break", "planning", "h
 MOST_REASONS = 5
 NO_OFFSETS: Mapping[str, float] = {}
 NO_COMPLAINTS: Mapping[str, str] = {}
+MOST_LIMIT_C = 200.0
+"""°C: no motor has a higher warning limit."""
 OFFSET_S, SLOW_S = 1.0, 0.1
 """Real seconds: clock offsets and round trips above these are findings."""
 
@@ -392,6 +394,13 @@ def check_arm(arm: ArmSnapshot, offset_s: float | None, *, malformed: str = "") 
     if arm.bad_sensor:
         wrong = f"{arm.arm} has impossible temperatures: {arm.bad_sensor}."
         findings.append(Finding("warning", wrong, "sensor", arm.arm))
+    if arm.joints and arm.temp_c and arm.joints != len(arm.temp_c):
+        counts = f"{len(arm.temp_c)} temperatures in its state, but {arm.joints} joints in its info"
+        findings.append(Finding("warning", f"{arm.arm} has {counts}."))
+    if arm.hottest_c is not None and arm.headroom_k is not None and arm.hottest_c + arm.headroom_k > MOST_LIMIT_C:
+        limit = f"a headroom of {arm.headroom_k:.1f} K at {arm.hottest_c:.1f} °C"
+        what = f"{arm.arm} reports {limit}: its warning limit would be above {MOST_LIMIT_C:.0f} °C."
+        findings.append(Finding("warning", what))
     if offset_s is not None and abs(offset_s) > OFFSET_S:
         unset = "it does not set its clock by the replies to clock/now"
         way = f"ahead of fleet time: {unset}."
