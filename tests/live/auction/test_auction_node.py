@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import pytest
 from msgspec.structs import replace
 
-from fleet.bus.client import BusClient
+from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Ack,
@@ -221,6 +221,16 @@ def test_what_is_wrong_with_a_quote_is_logged_once_and_is_the_reason_of_the_job(
     logged = [each.getMessage() for each in caplog.records if each.getMessage().startswith("Arm 'arm_0' ")]
     assert len(logged) == 1
     assert says in logged[0]
+
+
+def test_quotes_under_no_valid_key_are_logged_at_a_limited_rate(bus, caplog):
+    node = bus.auctioneer()
+    for _ in range(3):
+        node._end_quotes(
+            "r", Replies(refused={"thermofleet/v4/f/arm/.dot/quote": "'…/.dot/quote' is no key of this bus."})
+        )
+    logged = [each.getMessage() for each in caplog.records if each.getMessage().startswith("No quote")]
+    assert logged == ["No quote: '…/.dot/quote' is no key of this bus."]
 
 
 TWICE = ("Started", "Started")
