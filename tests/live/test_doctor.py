@@ -5,6 +5,7 @@ import socket
 import time
 from contextlib import ExitStack, contextmanager
 from functools import partial
+from itertools import count
 
 import msgspec
 import pytest
@@ -353,9 +354,11 @@ def participants(endpoint, *, states=True, clocks=1):
             link.declare_token(keys.of_auction("f", f"au{number}", "alive"))
             link.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=now_s(), speed=10.0))
 
+        ticks = count()
+
         def publish():
             if states:
-                arm.publish(keys.of_arm("f", "a", "state"), State("a", 1, now_s(), "idle", (30.0,), 30.0))
+                arm.publish(keys.of_arm("f", "a", "state"), State("a", next(ticks), now_s(), "idle", (30.0,), 30.0))
 
         with serving(arm, *auctioneers, meanwhile=publish):
             yield arm

@@ -382,7 +382,11 @@ def check_arm(arm: ArmSnapshot, offset_s: float | None, *, malformed: str = "") 
     findings = [Finding("fault", f"{arm.arm} {problem}", "absent", arm.arm, lasting=absent)] if problem else []
     if arm.doubled:
         findings.append(
-            Finding("fault", f"Two processes publish as arm {arm.arm}: its ticks go back and forth. Stop one.")
+            Finding(
+                "fault",
+                f"The ticks of {arm.arm} do not count up: two processes publish as this arm, so stop one, or it does "
+                "not count its states.",
+            )
         )
     if arm.mode == "faulted":
         hot = f"{arm.arm} is faulted: joint {arm.joint} is at {arm.hottest_c:.1f} °C."

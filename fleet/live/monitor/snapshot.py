@@ -48,7 +48,8 @@ QUIET_S = 2.5
 """Real seconds without any message after which a listener to several arms has no connection: before they count as
 absent."""
 MOST_STARTS, STARTS_S = 2, 5.0
-"""How often the states of an arm may begin again in that many real seconds: more often, two processes publish them."""
+"""How often the ticks of an arm may fail to count up in that many real seconds: more often, it is as if two processes
+publish them."""
 MAX_NAMES, MAX_JOBS, MAX_ALARMS = 1024, 4096, 256
 ENDED: tuple[auction.JobState, ...] = ("finished", *auction.ABANDONED)
 """States of jobs that need nobody any more."""
@@ -123,7 +124,7 @@ class ArmSnapshot(msgspec.Struct, frozen=True):
     away: bool = False
     """It reports that it is away from home."""
     doubled: bool = False
-    """Two processes publish its states: their ticks go back and forth."""
+    """The ticks of its states do not count up: two processes publish them, or the arm does not count."""
     scores: dict[str, JobScore] = {}
     """Of the jobs that have not ended."""
     p_saturation: float | None = None
@@ -209,7 +210,7 @@ class _Arm:
     break_end_s: float | None = None
     events: Counter[str] = field(default_factory=Counter[str])
     starts_s: deque[float] = field(default_factory=lambda: deque[float](maxlen=MOST_STARTS + 1))
-    """Real seconds of the last states with a lower tick than the one before."""
+    """Real seconds of the last states whose tick is not above that of the one before."""
     gap_s: float | None = None
     """Real seconds between its last two states."""
 
@@ -217,7 +218,7 @@ class _Arm:
         """Add the time since the last state to the work and heat of the arm."""
         before, before_s = self.last(State)
         self.gap_s = None if before is None else now_s - before_s
-        if before is not None and state.tick < before.tick:
+        if before is not None and state.tick <= before.tick and state.time_s != before.time_s:
             self.starts_s.append(now_s)
         passed_s = 0.0 if before is None else state.time_s - before.time_s
         if before is not None and passed_s > 0.0 and state.epoch == before.epoch:
@@ -231,7 +232,7 @@ class _Arm:
             self.break_end_s = event.time_s + (event.value or 0.0) if event.kind == "break" else None
 
     def is_doubled(self, now_s: float) -> bool:
-        """Return whether two processes publish its states."""
+        """Return whether the ticks of its states do not count up, as if two processes publish them."""
         return len(self.starts_s) > MOST_STARTS and now_s - self.starts_s[0] <= STARTS_S
 
     def last(self, kind: type[Message]) -> tuple[Message | None, float]:
