@@ -40,14 +40,18 @@ class Arm:
         self.closed = False  # our space may be closed to other arms, until a quote without a job
 
     def query_clock(self):
-        """Return the fleet time at zero of our clock, and its speed; without an auctioneer, our own time at speed 1."""
-        for reply in self.session.get(
-            f"{self.root}/clock/now", payload="{}", encoding=encoding("ClockRequest"), timeout=1.0
-        ):
-            if reply.ok is not None and str(reply.ok.encoding) == encoding("Clock"):
-                clock = json.loads(reply.ok.payload.to_bytes())
-                return clock["time_s"] - clock["speed"] * time.monotonic(), clock["speed"]
-        return -time.monotonic(), 1.0
+        """Return the fleet time at zero of our clock, and its speed, once a participant of the fleet replies."""
+        request = {"payload": "{}", "encoding": encoding("ClockRequest"), "timeout": 1.0}
+        hint_s = time.monotonic() + 5.0
+        while True:
+            for reply in self.session.get(f"{self.root}/clock/now", target=zenoh.QueryTarget.ALL, **request):
+                if reply.ok is not None and str(reply.ok.encoding) == encoding("Clock"):
+                    clock = json.loads(reply.ok.payload.to_bytes())
+                    return clock["time_s"] - clock["speed"] * time.monotonic(), clock["speed"]
+            if time.monotonic() > hint_s:
+                print("No participant of this fleet replies with the fleet time; waiting.", file=sys.stderr)
+                hint_s = float("inf")
+            time.sleep(0.2)
 
     def now_s(self):
         """Fleet time."""

@@ -77,6 +77,10 @@ MOST_PAYLOAD_KG = 5.0
 """Largest payload with which torques are explained."""
 
 
+BAD_SENSOR = "a sensor is bad, or this is not in °C"
+"""Cause of impossible temperatures."""
+
+
 @dataclass(frozen=True, eq=False)
 class BadReading:
     """Readings that a Gen3 cannot have."""
@@ -124,7 +128,7 @@ class TemperatureFilter:
 
     Attributes:
         temp_c: Last possible temperature by joint, °C.
-        bad: Sentence on the impossible readings of a joint, by joint.
+        bad: Sentence on the impossible readings of a joint, by joint; `BAD_SENSOR` is their cause.
     """
 
     def __init__(self) -> None:
@@ -168,7 +172,7 @@ class TemperatureFilter:
             self.temp_c[joint], self._good_s[joint] = now_c, time_s
             self.bad.pop(joint, None)
         else:
-            self.bad[joint] = f"joint {joint + 1} reads {now_c:.1f} °C{jump}; its sensor is bad, or this is not in °C"
+            self.bad[joint] = f"joint {joint + 1} reads {now_c:.1f} °C{jump}"
 
 
 def _change_k(dt_s: float) -> float:

@@ -137,7 +137,6 @@ class SimulatedClient:
         self.process, self.world, self.fleet = process, process.world, fleet
         self.bus: Bus = process.world.bus
         self.malformed = self.overrun = 0
-        self.rejections: deque[str] = deque(maxlen=8)
         self.elapsed = False
         self.own_tokens: list[str] = []
         self.watches: list[tuple[str, Handle, set[str]]] = []

@@ -10,7 +10,7 @@ import logging
 import math
 import threading
 import time
-from collections import deque
+from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -42,6 +42,8 @@ Arguments = TypeVarTuple("Arguments")
 BACKLOG = 4096
 MOST_REPLIES = 1024
 """Replies to one query that are read: one of each arm of the largest fleet."""
+MOST_REJECTIONS, MOST_CHARACTERS = 1024, 2048
+"""Places whose last malformed message is kept (a state of each arm of the largest fleet); length of a kept reason."""
 
 Action = Literal["publish", "show the token", "reply to", "query"]
 """What a certificate may or may not allow under a key."""
@@ -100,6 +102,11 @@ class Replies(Generic[Message]):
         raise NoReply(key, late=bool(self.refused))
 
 
+def under(key: str) -> str:
+    """Place of the malformed messages that are published under a key."""
+    return f"under '{key}'"
+
+
 def replier(key: str) -> str:
     """Who replies to the queries of a key, for example `auctioneer` or `arm 'arm_0'`."""
     sender = channel_of(key).sender
@@ -127,7 +134,7 @@ class BusClient(Connection):
     Attributes:
         fleet: Name of the fleet, part of every key.
         malformed: Number of messages that violate the contract.
-        rejections: The reasons, for the last of them.
+        rejections: The reason and the monotonic second of the last of them at each place; the newest last.
         overrun: Messages dropped because `serve` was not called for too long.
     """
 
@@ -150,7 +157,7 @@ class BusClient(Connection):
         super().__init__(endpoint, timeout_s, stopped)
         self.fleet = fleet
         self.malformed = 0
-        self.rejections: deque[str] = deque(maxlen=8)
+        self.rejections: OrderedDict[str, tuple[str, float]] = OrderedDict()
         self.overrun = 0
         self._calls: Mailbox[tuple[Callable[..., None], tuple[Any, ...]]] = Mailbox(backlog)
         self._participant: RosterEntry | None = None
@@ -400,7 +407,7 @@ class BusClient(Connection):
                 payload = sample.payload.to_bytes()
                 name, message = read_message(kind, str(sample.key_expr), str(sample.encoding), payload)
             except ValueError as error:
-                self.reject(f"under '{sample.key_expr}': {error}")
+                self.reject(under(str(sample.key_expr)), error)
             else:
                 handle(name, message)
 
@@ -445,10 +452,23 @@ class BusClient(Connection):
             self._token(str(reply.ok.key_expr), True, lambda name, _: names.add(name))
         return frozenset(names)
 
-    def reject(self, reason: str) -> None:
-        """Count and log a malformed message."""
+    def complaints(self, since_s: float = -math.inf) -> dict[str, str]:
+        """The last reason at each place with malformed messages since a monotonic second; the newest last."""
+        return {place: reason for place, (reason, at_s) in self.rejections.items() if at_s >= since_s}
+
+    def reject(self, place: str, error: object) -> None:
+        """Count and log a malformed message.
+
+        Args:
+            place: Where it was, for example `under`; `rejections` keeps the last one of each.
+        """
         self.malformed += 1
-        self.rejections.append(reason)
+        reason = f"{place}: {error}"
+        place = place[:MOST_CHARACTERS]
+        self.rejections[place] = reason[:MOST_CHARACTERS], time.monotonic()
+        self.rejections.move_to_end(place)
+        if len(self.rejections) > MOST_REJECTIONS:
+            self.rejections.popitem(last=False)
         if self.malformed & (self.malformed - 1) == 0:  # 1, 2, 4, 8, …: a flood of messages must not flood the log
             _LOG.warning("Dropped invalid message (%d so far): %s", self.malformed, reason)
 
@@ -462,7 +482,7 @@ class BusClient(Connection):
         try:
             name = keys.parse(key).name
         except ValueError as error:
-            self.reject(str(error))
+            self.reject(f"token '{key}'", error)
         else:
             handle(name, present)
 
@@ -475,7 +495,7 @@ class BusClient(Connection):
             self.post(self._reply, key, query, kind, handle)
             return
         refusal = Refusal(f"The request has {size:,} bytes, and at most {MOST_BYTES:,} are allowed.")
-        self.post(self.reject, f"query of '{key}': {refusal.reason}")
+        self.post(self.reject, f"query of '{key}'", refusal.reason)
         with query, suppress(ValueError):  # if there is no key to reply under
             query.reply(keys.answered(key, str(query.key_expr)), encode(refusal), encoding=encoding(Refusal))
 
@@ -486,7 +506,7 @@ class BusClient(Connection):
             try:
                 own_key = keys.answered(key, str(query.key_expr))
             except ValueError as error:  # there is no key to reply under
-                self.reject(f"query of '{query.key_expr}': {error}")
+                self.reject(f"query of '{query.key_expr}'", error)
                 return
             try:
                 payload = b"" if query.payload is None else query.payload.to_bytes()
@@ -495,7 +515,7 @@ class BusClient(Connection):
                     check_name(request, keys.parse(own_key).asker, "arm")
                 reply = handle(request)
             except MalformedMessage as error:
-                self.reject(f"query of '{own_key}': {error}")
+                self.reject(f"query of '{own_key}'", error)
                 reply = Refusal(str(error))
             except Refused as refused:
                 reply = Refusal(str(refused), refused.temporary)
@@ -552,7 +572,7 @@ class _PendingQuery(Generic[Reply]):
             _, message = read_message(kind, key, sent_encoding, reply.ok.payload.to_bytes())
         except ValueError as error:
             _add(self._replies.refused, key, str(error))
-            self._client.reject(f"reply under '{key}': {error}")
+            self._client.reject(f"reply under '{key}'", error)
             return
         if isinstance(message, Refusal):
             _add(self._replies.refused, key, message.reason)

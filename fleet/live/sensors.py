@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import Quote
 from fleet.bus.protocol.messages import State
-from fleet.readings import SPEED_RAD_S, TEMP_STEP_K, TORQUE_NM, TemperatureFilter, most_temp_change_k
+from fleet.readings import BAD_SENSOR, SPEED_RAD_S, TEMP_STEP_K, TORQUE_NM, TemperatureFilter, most_temp_change_k
 from fleet.robot import JOINTS, ThermalLimits
 
 if TYPE_CHECKING:
@@ -37,7 +37,8 @@ class ArmSensors:
     @property
     def fault(self) -> str:
         """Sentence on the impossible temperatures of the last state; "" without any."""
-        return "; ".join(self._filter.bad[joint] for joint in sorted(self._filter.bad))
+        bad = self._filter.bad
+        return "; ".join([*(bad[joint] for joint in sorted(bad)), BAD_SENSOR]) if bad else ""
 
     @property
     def why_unfit(self) -> str:

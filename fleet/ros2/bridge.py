@@ -25,7 +25,7 @@ from fleet.live.arm.node import ClockSync
 from fleet.live.clock import FleetClock
 from fleet.live.monitor.snapshot import Recent
 from fleet.live.rate_limit import WARNING_S, RateLimitedWarnings
-from fleet.readings import TemperatureFilter
+from fleet.readings import BAD_SENSOR, TemperatureFilter
 from fleet.robot import ThermalLimits, half_turn
 from fleet.ros2.cdr import (
     DIAGNOSTICS,
@@ -287,9 +287,9 @@ class Follower:
                 temp_c = temperatures(read_diagnostics(payload), self._readings.names, self._readings.hardware)
                 self._readings.update_temperatures(temp_c, now_s)
                 for sentence in self._readings.sensors.bad.values():
-                    self._warn(f"sensor of {sentence[:7]}", f"has an impossible temperature: {sentence}.")
+                    self._warn(f"sensor of {sentence[:7]}", f"has an impossible temperature: {sentence}; {BAD_SENSOR}.")
         except MalformedMessage as error:
-            self._link.reject(f"of {topic.name}: {error}")
+            self._link.reject(f"of {topic.name}", error)
 
     def _send_state(self, now_s: float) -> None:
         self._tick += 1

@@ -94,7 +94,7 @@ def examine(
             snapshots.append(listener.view.snapshot(time.monotonic()))
         now_s = time.monotonic()
         snapshot = listener.view.snapshot(now_s)
-        problems = {"malformed": link.malformed, "complaints": tuple(link.rejections), "overrun": link.overrun}
+        problems = {"malformed": link.malformed, "complaints": link.complaints(), "overrun": link.overrun}
     secure = identified(endpoint)[1] is not None
     others = other_versions(endpoint, fleet)
     report = check_health(

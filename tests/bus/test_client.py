@@ -11,11 +11,11 @@ from contextlib import ExitStack
 
 import pytest
 
-from fleet.bus.client import MOST_REPLIES, BusClient, Refused, _PendingQuery
+from fleet.bus.client import MOST_REJECTIONS, MOST_REPLIES, BusClient, Refused, _PendingQuery, under
 from fleet.bus.mailbox import Mailbox
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Admission, ArmEvent, Clock, ClockRequest, JobSpec, Submission, SubmissionReply
-from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, decode, encode, encoding
+from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, State, decode, encode, encoding
 from fleet.bus.router import Router
 from fleet.errors import BusError
 from fleet.live.supervisor import Supervisor
@@ -234,6 +234,23 @@ def test_words_that_speak_for_another_are_left_out(bus):
     serve_until(lambda: heard, listener)
     assert heard == ["arm_2"]
     assert listener.malformed == 2
+
+
+def test_the_last_malformed_message_of_each_sender_is_kept(bus):
+    listener, stranger = bus(), bus()
+    listener.subscribe(keys.of_every_arm("f", "state"), State, lambda arm, word: None)
+    meet(listener, stranger)
+    places = [keys.of_arm("f", f"arm_{number}", "state") for number in range(20)]
+    for place in [*places, places[0]]:
+        raw(stranger).put(place, b"{", encoding=encoding(State))
+    serve_until(lambda: listener.malformed == 21, listener)
+    assert list(listener.complaints()) == [under(place) for place in (*places[1:], places[0])]
+    assert "Not a thermofleet.State.v4" in listener.complaints()[under(places[7])]
+    assert listener.complaints(math.inf) == {}
+    for number in range(MOST_REJECTIONS):
+        listener.reject(f"flood {number}", "x" * MOST_BYTES)
+    assert len(listener.rejections) == MOST_REJECTIONS
+    assert max(map(len, listener.complaints().values())) < MOST_BYTES
 
 
 def test_who_comes_and_goes_is_seen(bus):

@@ -199,14 +199,17 @@ states = st.builds(
 @st.composite
 def difficulty_words(draw):
     jobs = tuple(draw(st.lists(names, max_size=5, unique=True)))
-    columns = st.lists(st.none() | numbers, min_size=len(jobs), max_size=len(jobs)).map(tuple)
+
+    def columns(most):
+        return draw(st.lists(st.none() | st.floats(0, most), min_size=len(jobs), max_size=len(jobs)).map(tuple))
+
     plans = draw(st.integers(0, 3)) * len(jobs)
 
     def bids(values):
         return draw(st.lists(st.none() | values, min_size=plans, max_size=plans).map(tuple))
 
     return DifficultyScores(
-        *(draw(names), draw(ticks), draw(numbers), draw(names), jobs, draw(columns), draw(columns)),
+        *(draw(names), draw(ticks), draw(numbers), draw(names), jobs, columns(1e6), columns(1)),
         bid_duration_s=bids(st.floats(0, 1e6)),
         bid_peak_c=bids(st.floats(-50, 200)),
         bid_p_saturation=bids(st.floats(0, 1)) if draw(st.booleans()) else (),
@@ -261,6 +264,36 @@ def test_no_number_is_said_that_is_none(message, field, value, bad):
 def test_a_malformed_state_is_refused_with_words(payload):
     with pytest.raises(MalformedMessage, match=r"thermofleet\.State\.v4"):
         received(State, payload, "arm_0")
+
+
+QUOTE = trade.Quote("a", "r", "q", 3.0, "t", 1.0, "idle", 20.0, 1, (trade.JobEstimate("j", (trade.PlanQuote(),)),))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"difficulty": -9.0},
+        {"joint_difficulty": (0.1, -0.1)},
+        {"peak_c": 1001.0},
+        {"peak_c": -300.0},
+        {"valid_s": -5.0},
+    ],
+    ids=str,
+)
+def test_a_quote_with_impossible_numbers_is_refused(change):
+    def quote(**change):
+        plan = replace(trade.PlanQuote(), **{name: value for name, value in change.items() if name != "valid_s"})
+        valid_s = change.get("valid_s", 0.0)
+        return replace(QUOTE, valid_s=valid_s, estimates=(trade.JobEstimate("j", (plan,)),))
+
+    assert received(trade.Quote, encode(quote(difficulty=0.0, peak_c=59.9)), "a").estimates[0].plans[0].peak_c == 59.9
+    with pytest.raises(MalformedMessage, match=r"thermofleet\.Quote\.v4"):
+        received(trade.Quote, encode(quote(**change)), "a")
+
+
+def test_a_state_whose_work_ends_in_the_past_is_refused():
+    with pytest.raises(MalformedMessage, match="busy_s"):
+        received(State, encode(replace(STATE, busy_s=-50.0)), "arm_0")
 
 
 def test_an_integer_is_a_number_and_an_encoding_has_a_version():

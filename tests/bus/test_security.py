@@ -241,7 +241,7 @@ def test_an_arm_neither_renews_nor_reports_nor_claims_for_another(side, connect,
         assert ask_as("arm_1", "arm_0") == ["Refusal"] * 2
         assert taken == []
         assert auctioneer.malformed == 2
-        assert "under the key of 'arm_1' claims to be by 'arm_0'" in auctioneer.rejections[-1]
+        assert "under the key of 'arm_1' claims to be by 'arm_0'" in list(auctioneer.complaints().values())[-1]
         assert ask_as("arm_0", "arm_0") == ([] if side == "guarded" else [answer] * 2)
         assert ask_as("arm_1", "arm_1") == [answer] * 2
         assert taken == ([] if side == "guarded" else ["arm_0"] * 2) + ["arm_1"] * 2

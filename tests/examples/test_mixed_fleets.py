@@ -25,9 +25,9 @@ def test_the_examples_alone_make_a_fleet(bus):
     with started(program("monitor", port)) as monitor:
         assert monitor.stdout.readline().startswith("waiting")
         with (
+            running("own_allocator", port, "f"),
             running("own_arm", port, "f", "a"),
             running("own_arm", port, "f", "b"),
-            running("own_allocator", port, "f"),
         ):
             submit_jobs(port)
             serve_until(lambda: sum(status.state == "finished" for status in statuses) >= 3, watcher)

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from fleet.bus.client import BusClient
+from fleet.bus.client import AnotherReplies, BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Ack,
@@ -30,7 +30,7 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.messages import DifficultyScores, State
 from fleet.bus.router import Router
 from tests.examples.programs import program, running, started
-from tests.waiting import PATIENCE_S, serve_until
+from tests.waiting import PATIENCE_S, serve_until, serving
 
 JOB = JobSpec(name="crate 1", kind="hold", places=("rack",), repetitions=3, payload_kg=1.0)
 
@@ -98,6 +98,23 @@ def test_own_arm_follows_the_rules_of_a_strict_auctioneer(bus):
         assert (reports[0].outcome, reports[0].cycles, reports[0].job) == ("finished", 3, "crate 1")
     serve_until(lambda: ("arm 1+b", False) in tokens, auctioneer)
     assert auctioneer.malformed == 0
+
+
+def test_own_arm_waits_for_the_fleet_time_which_an_arm_of_the_fleet_keeps_too(bus):
+    """In a fleet without an auctioneer every arm declares the key of the clock, and the first one by name replies."""
+    port, link = bus
+    second, first, states = link(), link(), []
+    first.subscribe(keys.of_every_arm("f", "state"), State, lambda _, state: states.append(state))
+
+    def leave_to_another(_):
+        raise AnotherReplies
+
+    second.reply_to(keys.of_clock("f"), ClockRequest, leave_to_another)
+    with started(program("own_arm", port, "f", "x"), stderr=subprocess.PIPE) as process, serving(second):
+        assert process.stderr.readline().startswith("No participant of this fleet replies with the fleet time")
+        first.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=5000.0, speed=60.0))
+        serve_until(lambda: states, first)
+    assert states[0].time_s >= 5000.0
 
 
 def test_own_allocator_follows_the_rules_of_a_strict_arm(bus):
@@ -177,8 +194,8 @@ def reply_to_malformed():
         router = stack.enter_context(Router())
         port = int(router.endpoint.rsplit(":", 1)[1])
         client = stack.enter_context(BusClient(router.endpoint, "f"))
-        stack.enter_context(running("own_arm", port, "f", "x"))
         stack.enter_context(running("own_allocator", port, "f"))
+        stack.enter_context(running("own_arm", port, "f", "x"))
 
         def ask(example, topic, payload, encoding):
             key = keys.of_arm("f", "x", topic) if example == "own_arm" else keys.asked_by("f", "own", topic, "x")

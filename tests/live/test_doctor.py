@@ -5,19 +5,20 @@ import socket
 import time
 from contextlib import ExitStack, contextmanager
 from functools import partial
+from itertools import count
 
 import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.bus.client import BusClient
+from fleet.bus.client import BusClient, under
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Clock, ClockRequest, JobStatus
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Alarm
 from fleet.bus.router import Router
-from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_fleet, check_health, check_progress
+from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_arm, check_fleet, check_health, check_progress
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, AuctioneerSnapshot, FleetSnapshot
 from scenarios.show.watch import space_line
 from tests import commands
@@ -164,7 +165,7 @@ def test_a_healthy_fleet_has_no_findings():
         ),
         (
             fleet(arm(), arm(arm="b", time_s=5060.0 - 60.0 * 3)),
-            "b is 3.0 real seconds behind fleet time: its machine may be overloaded",
+            "b is 3.0 real seconds behind fleet time: it does not set its clock by the replies to clock/now, or its",
         ),
     ],
 )
@@ -204,7 +205,7 @@ def test_a_fleet_that_needs_no_auctioneer_is_healthy_without_one():
 
 
 def test_malformed_messages_are_a_fault_with_each_reason_once():
-    output, _ = faults(fleet(arm()), malformed=3, complaints=["no JSON.", "no State.", "no JSON."])
+    output, _ = faults(fleet(arm()), malformed=3, complaints={"a": "no JSON.", "b": "no State.", "c": "no JSON."})
     assert output == ["3 malformed message(s), the last: no JSON.; no State."]
 
 
@@ -217,9 +218,40 @@ def test_malformed_messages_are_a_fault_with_each_reason_once():
 )
 def test_an_arm_whose_states_are_malformed_is_not_said_to_hang(age_s, says):
     now = fleet(arm(), arm(arm="b", present=False, state_age_s=age_s, time_s=None))
-    complaint = f"under '{keys.of_arm(now.fleet, 'b', 'state')}': Not a thermofleet.State.v4: no JSON."
-    output, _ = faults(now, malformed=1, complaints=[complaint])
+    place = under(keys.of_arm(now.fleet, "b", "state"))
+    output, _ = faults(now, malformed=1, complaints={place: f"{place}: Not a thermofleet.State.v4: no JSON."})
     assert says in output
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"token": False, "state_age_s": 0.5}, "it publishes its state but shows no token"),
+        ({"token": False, "state_age_s": 3.5}, "it has left, or its process hangs or has ended."),
+        ({"state_age_s": 5.0, "state_gap_s": 10.0}, "its last two states came 10.0 s apart"),
+        ({"state_age_s": 5.0, "state_gap_s": 0.1}, "it has left, or its process hangs or has ended."),
+    ],
+)
+def test_the_alarm_of_an_absent_arm_names_its_cause(change, why):
+    (finding,) = check_arm(arm(present=False, **change), None)
+    assert finding.lasting.startswith(f"a is absent: {why}")
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"joints": 7, "temp_c": (30.0,) * 6}, "a has 6 temperatures in its state, but 7 joints in its info."),
+        ({"joints": 7, "temp_c": (30.0,) * 7, "hottest_c": 30.0, "headroom_k": 30.0}, ""),
+        ({"joints": 7}, ""),  # it has no thermometers
+        (
+            {"hottest_c": 30.6, "headroom_k": 500.0},
+            "a reports a headroom of 500.0 K at 30.6 °C: its warning limit would",
+        ),
+    ],
+)
+def test_a_state_that_contradicts_itself_is_a_warning(change, what):
+    findings = check_arm(arm(**change), None)
+    assert [(each.level, each.what[: len(what)]) for each in findings] == [("warning", what)] * bool(what)
 
 
 def test_an_arm_that_answers_no_awards_is_named():
@@ -322,9 +354,11 @@ def participants(endpoint, *, states=True, clocks=1):
             link.declare_token(keys.of_auction("f", f"au{number}", "alive"))
             link.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=now_s(), speed=10.0))
 
+        ticks = count()
+
         def publish():
             if states:
-                arm.publish(keys.of_arm("f", "a", "state"), State("a", 1, now_s(), "idle", (30.0,), 30.0))
+                arm.publish(keys.of_arm("f", "a", "state"), State("a", next(ticks), now_s(), "idle", (30.0,), 30.0))
 
         with serving(arm, *auctioneers, meanwhile=publish):
             yield arm

@@ -57,6 +57,7 @@ def test_an_arm_that_reports_another_unit_is_bad_as_a_whole():
     fahrenheit = tuple(1.8 * c + 32 for c in GOOD_C)
     checked = sensors.check(State("arm", 1, 0.1, "faulted", fahrenheit, -45.0))
     assert (set(checked.temp_c), sensors.fault.count("joint")) == ({60.0}, 7)
+    assert (sensors.fault.count("sensor"), sensors.fault.endswith("not in °C")) == (1, True)
 
 
 def test_an_arm_that_starts_again_may_have_another_temperature():

@@ -18,7 +18,18 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from fleet.bus.protocol.messages import MOST, Count, Duration, FiniteStruct, Name, Number, Person, Share
+from fleet.bus.protocol.messages import (
+    MOST,
+    Celsius,
+    Count,
+    Difficulty,
+    Duration,
+    FiniteStruct,
+    Name,
+    Number,
+    Person,
+    Share,
+)
 from fleet.errors import check_names
 from fleet.fields import MAX_SPEED, MIN_SPEED
 from fleet.job import (
@@ -146,15 +157,15 @@ class PlanQuote(FiniteStruct, frozen=True, omit_defaults=True):
 
     plan: Count = 0
     """Number of the plan: an `Award` names it. Different for each plan of a job."""
-    peak_c: Number | None = None
+    peak_c: Celsius | None = None
     """Predicted temperature of the hottest motor during the job."""
     gained_k: Number | None = None
     """`peak_c` above the hottest motor now."""
     p_saturation: Share | None = None
     """Probability that a motor passes the warning limit, starting from the present temperatures."""
-    joint_difficulty: tuple[Number, ...] | None = None
+    joint_difficulty: tuple[Difficulty, ...] | None = None
     """d_k, [joint]."""
-    difficulty: Number | None = None
+    difficulty: Difficulty | None = None
     """d = Σ_k w_k d_k, with the weights of the arm's twin (`fleet.difficulty`)."""
     duration_s: PlanTime | None = None
     """Duration of the job alone, from home to home."""
@@ -201,7 +212,7 @@ class Quote(FiniteStruct, frozen=True):
     auction: Name
     quote: str
     """Name of this quote, which this arm never uses again, not even after a restart; "" for a dry run."""
-    valid_s: Number
+    valid_s: Duration
     """Real seconds during which the arm accepts an award that refers to it, counted by the arm."""
     twin: str
     """Version of the twin that scored."""

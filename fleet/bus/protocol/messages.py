@@ -32,6 +32,7 @@ Number = Annotated[float, msgspec.Meta(ge=LEAST, le=MOST)]
 """Any quantity without bounds of its own: no sum or product of a few of them overflows."""
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Duration = Annotated[float, msgspec.Meta(ge=0, le=MOST)]
+Difficulty = Annotated[float, msgspec.Meta(ge=0, le=MOST)]
 Celsius = Annotated[float, msgspec.Meta(ge=-273.15, le=1000)]
 
 
@@ -72,7 +73,7 @@ class State(FiniteStruct, frozen=True, omit_defaults=True):
     """The current job; "" for none."""
     space: str = ""
     """Name of the space that the arm takes while it is away from home; "" at home, or if not reported."""
-    busy_s: Number = 0.0
+    busy_s: Duration = 0.0
     """Time until it is home with its current job done."""
     housing_c: tuple[Celsius, ...] = ()
     """Estimated housing temperatures, which have no sensor, [joint]."""
@@ -125,11 +126,11 @@ class DifficultyScores(FiniteStruct, frozen=True, omit_defaults=True):
     """Version of the twin that predicted."""
     jobs: tuple[Name, ...]
     """Names of the open jobs, each once; the columns of the lists below."""
-    difficulty: tuple[Number | None, ...]
+    difficulty: tuple[Difficulty | None, ...]
     """d, [job]; null where the arm has no score or cannot do the job."""
-    p_saturation: tuple[Number | None, ...]
+    p_saturation: tuple[Share | None, ...]
     """Probability that a motor passes the warning limit, [job]; null where unknown."""
-    peak_c: tuple[Number | None, ...] = ()
+    peak_c: tuple[Celsius | None, ...] = ()
     """Predicted temperature of the hottest motor during the job, [job]; null where unknown, empty if all are."""
     bid_duration_s: tuple[Duration | None, ...] = ()
     """Bids: time that each plan for each job takes, the plans of the first job first, as many for each job; null where

@@ -452,7 +452,7 @@ class AuctionNode(JobDesk):
             if reason and (arm := _arm_of(key)):
                 self._note_unusable_quote(auction, arm, "invalid", f"gave no valid quote: {reason.rstrip('.')}")
             elif reason:
-                _LOG.warning("No quote: %s", reason)
+                self._warnings.setdefault("", RateLimitedWarnings(""))("quote", f"No quote: {reason}")
         self.auctioneer.end_quotes(auction)
 
     def _add_quote(self, request: QuoteRequest, quote: Quote) -> None:

@@ -144,8 +144,6 @@ class AsyncBridge:
         link.watch_tokens(keys.of_every(self.fleet, "monitor", "alive"), self._monitor)
         self._check_s = time.monotonic() + FRESH_S  # by then it has heard from everybody who is there
         self._earlier = deque[FleetSnapshot](maxlen=3)
-        self._malformed = 0
-        """Malformed messages until the last check."""
         self._known: list[Finding] = []
         """Findings of the last check with a connection to the router."""
         self._told = {each.alarm: (each.ended_s is None, each.by) for each in self._alarms.alarms.values()}
@@ -246,13 +244,12 @@ class AsyncBridge:
     def _check_alarms(self, real_s: float) -> None:
         """Begin and end alarms by what the fleet shows."""
         now = self._listener.view.snapshot(real_s)
-        count, self._malformed = self._link.malformed - self._malformed, self._link.malformed
-        new = list(self._link.rejections)[-count:] if count else []
         if lost := check_connection(now):
             self._earlier.clear()
         else:
             earlier = self._earlier[0] if len(self._earlier) == self._earlier.maxlen else None
-            self._known = check_fleet(now, earlier, malformed=complaints_of_states(now, new))
+            complaints = self._link.complaints(real_s - FRESH_S)
+            self._known = check_fleet(now, earlier, malformed=complaints_of_states(now, complaints))
             self._earlier.append(now)
         findings = [*self._known, *lost]
         heard = {each.arm for each in now.arms} | {each.job for each in now.jobs}

@@ -10,6 +10,7 @@ from typing import Literal, get_args
 
 import msgspec
 
+from fleet.bus.client import under
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.operator import ALL_ARMS, by_whom
 from fleet.bus.security.tls import UNKNOWN_CERTIFICATE
@@ -36,6 +37,8 @@ EXPECTED = ("release", "predecessor", "paused", "queue", "break", "planning", "h
 MOST_REASONS = 5
 NO_OFFSETS: Mapping[str, float] = {}
 NO_COMPLAINTS: Mapping[str, str] = {}
+MOST_LIMIT_C = 200.0
+"""°C: no motor has a higher warning limit."""
 OFFSET_S, SLOW_S = 1.0, 0.1
 """Real seconds: clock offsets and round trips above these are findings."""
 
@@ -108,7 +111,7 @@ def check_health(
     probes: Sequence[ClockProbe],
     *,
     malformed: int = 0,
-    complaints: Sequence[str] = (),
+    complaints: Mapping[str, str] = NO_COMPLAINTS,
     overrun: int = 0,
     auctioneer: bool = True,
     secure: bool = False,
@@ -120,7 +123,7 @@ def check_health(
 
     Args:
         fleet: Snapshot at the real second `now_s`.
-        complaints: Reasons why the last malformed messages were dropped.
+        complaints: Why the last malformed message at each place was dropped, as `BusClient.complaints`.
         overrun: Messages lost because the queue was full.
         auctioneer: Whether the fleet should have one.
         secure: Whether the listener used a certificate; one that the router does not know receives nothing.
@@ -155,7 +158,7 @@ def check_health(
     if trips_s and median(trips_s) > SLOW_S:
         findings.append(Finding("warning", f"The router is slow: a round trip takes {1000 * median(trips_s):.0f} ms."))
     if malformed:
-        reasons = "; ".join(dict.fromkeys(complaints))  # each reason once
+        reasons = "; ".join(list(dict.fromkeys(complaints.values()))[-MOST_REASONS:])  # each reason once
         findings.append(Finding("fault", f"{malformed} malformed message(s), the last: {reasons}"))
     if overrun:
         findings.append(
@@ -350,12 +353,10 @@ def check_auctioneers(fleet: FleetSnapshot, probes: Sequence[ClockProbe], wanted
     return [Finding("fault", problem)]
 
 
-def complaints_of_states(fleet: FleetSnapshot, complaints: Sequence[str]) -> dict[str, str]:
+def complaints_of_states(fleet: FleetSnapshot, complaints: Mapping[str, str]) -> dict[str, str]:
     """The last complaint about a state of each arm, without the key that it names."""
-    names = {f"under '{keys.of_arm(fleet.fleet, arm.arm, 'state')}': ": arm.arm for arm in fleet.arms}
-    return {
-        arm: complaint.partition(key)[2] for complaint in complaints for key, arm in names.items() if key in complaint
-    }
+    places = {arm.arm: under(keys.of_arm(fleet.fleet, arm.arm, "state")) for arm in fleet.arms}
+    return {arm: complaints[place].removeprefix(f"{place}: ") for arm, place in places.items() if place in complaints}
 
 
 def check_arm(arm: ArmSnapshot, offset_s: float | None, *, malformed: str = "") -> list[Finding]:
@@ -367,19 +368,29 @@ def check_arm(arm: ArmSnapshot, offset_s: float | None, *, malformed: str = "") 
     age_s = arm.state_age_s
     if not arm.token and age_s is None:
         return [Finding("warning", f"{arm.arm} has left: it has no token, but some of its messages are still cached.")]
-    problem, cause = "", "its states are malformed." if malformed else "its process may hang."
+    problem, cause = "", "its process may hang."
+    why = "it has left, or its process hangs or has ended."
+    if malformed:
+        cause, why = "its states are malformed.", f"its states are malformed: {malformed}"
+    elif arm.token and arm.state_gap_s is not None and arm.state_gap_s > FRESH_S:
+        why = cause = f"its last two states came {arm.state_gap_s:.1f} s apart, and at least two a second are needed."
     if not arm.token:
         problem = "publishes its state but shows no token: it left, or another process uses its name."
     elif age_s is None:
         problem = f"shows its token but publishes no {'valid ' if malformed else ''}state: {cause}"
     elif age_s > FRESH_S:
         problem = f"is stale, with a last state {age_s:.1f} s old: {cause}"
-    why = f"its states are malformed: {malformed}" if malformed else "it has left, or its process hangs or has ended."
+    if not arm.token and age_s is not None and age_s <= FRESH_S:
+        why = f"it {problem}"
     absent = f"{arm.arm} is absent: {why}"
     findings = [Finding("fault", f"{arm.arm} {problem}", "absent", arm.arm, lasting=absent)] if problem else []
     if arm.doubled:
         findings.append(
-            Finding("fault", f"Two processes publish as arm {arm.arm}: its ticks go back and forth. Stop one.")
+            Finding(
+                "fault",
+                f"The ticks of {arm.arm} do not count up: two processes publish as this arm, so stop one, or it does "
+                "not count its states.",
+            )
         )
     if arm.mode == "faulted":
         hot = f"{arm.arm} is faulted: joint {arm.joint} is at {arm.hottest_c:.1f} °C."
@@ -391,10 +402,18 @@ def check_arm(arm: ArmSnapshot, offset_s: float | None, *, malformed: str = "") 
     if arm.bad_sensor:
         wrong = f"{arm.arm} has impossible temperatures: {arm.bad_sensor}."
         findings.append(Finding("warning", wrong, "sensor", arm.arm))
+    if arm.joints and arm.temp_c and arm.joints != len(arm.temp_c):
+        counts = f"{len(arm.temp_c)} temperatures in its state, but {arm.joints} joints in its info"
+        findings.append(Finding("warning", f"{arm.arm} has {counts}."))
+    if arm.hottest_c is not None and arm.headroom_k is not None and arm.hottest_c + arm.headroom_k > MOST_LIMIT_C:
+        limit = f"a headroom of {arm.headroom_k:.1f} K at {arm.hottest_c:.1f} °C"
+        what = f"{arm.arm} reports {limit}: its warning limit would be above {MOST_LIMIT_C:.0f} °C."
+        findings.append(Finding("warning", what))
     if offset_s is not None and abs(offset_s) > OFFSET_S:
-        way = "ahead of fleet time: it does not set its clock by the replies to clock/now."
+        unset = "it does not set its clock by the replies to clock/now"
+        way = f"ahead of fleet time: {unset}."
         if offset_s < 0:
-            way = "behind fleet time: its machine may be overloaded, or its process hang."
+            way = f"behind fleet time: {unset}, or its machine may be overloaded, or its process hang."
         findings.append(Finding("fault", f"{arm.arm} is {abs(offset_s):.1f} real seconds {way}"))
     return findings
 

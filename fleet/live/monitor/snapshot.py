@@ -48,7 +48,8 @@ QUIET_S = 2.5
 """Real seconds without any message after which a listener to several arms has no connection: before they count as
 absent."""
 MOST_STARTS, STARTS_S = 2, 5.0
-"""How often the states of an arm may begin again in that many real seconds: more often, two processes publish them."""
+"""How often the ticks of an arm may fail to count up in that many real seconds: more often, it is as if two processes
+publish them."""
 MAX_NAMES, MAX_JOBS, MAX_ALARMS = 1024, 4096, 256
 ENDED: tuple[auction.JobState, ...] = ("finished", *auction.ABANDONED)
 """States of jobs that need nobody any more."""
@@ -123,7 +124,7 @@ class ArmSnapshot(msgspec.Struct, frozen=True):
     away: bool = False
     """It reports that it is away from home."""
     doubled: bool = False
-    """Two processes publish its states: their ticks go back and forth."""
+    """The ticks of its states do not count up: two processes publish them, or the arm does not count."""
     scores: dict[str, JobScore] = {}
     """Of the jobs that have not ended."""
     p_saturation: float | None = None
@@ -144,6 +145,8 @@ class ArmSnapshot(msgspec.Struct, frozen=True):
     """Its last event."""
     state_age_s: float | None = None
     """Since it arrived."""
+    state_gap_s: float | None = None
+    """Between the arrivals of its last two states."""
     difficulty_age_s: float | None = None
     """Since it was sent, by the arm's clock; since it arrived while the fleet's speed is unknown."""
 
@@ -207,12 +210,15 @@ class _Arm:
     break_end_s: float | None = None
     events: Counter[str] = field(default_factory=Counter[str])
     starts_s: deque[float] = field(default_factory=lambda: deque[float](maxlen=MOST_STARTS + 1))
-    """Real seconds of the last states with a lower tick than the one before."""
+    """Real seconds of the last states whose tick is not above that of the one before."""
+    gap_s: float | None = None
+    """Real seconds between its last two states."""
 
     def follow(self, state: State, now_s: float) -> None:
         """Add the time since the last state to the work and heat of the arm."""
-        before, _ = self.last(State)
-        if before is not None and state.tick < before.tick:
+        before, before_s = self.last(State)
+        self.gap_s = None if before is None else now_s - before_s
+        if before is not None and state.tick <= before.tick and state.time_s != before.time_s:
             self.starts_s.append(now_s)
         passed_s = 0.0 if before is None else state.time_s - before.time_s
         if before is not None and passed_s > 0.0 and state.epoch == before.epoch:
@@ -226,7 +232,7 @@ class _Arm:
             self.break_end_s = event.time_s + (event.value or 0.0) if event.kind == "break" else None
 
     def is_doubled(self, now_s: float) -> bool:
-        """Return whether two processes publish its states."""
+        """Return whether the ticks of its states do not count up, as if two processes publish them."""
         return len(self.starts_s) > MOST_STARTS and now_s - self.starts_s[0] <= STARTS_S
 
     def last(self, kind: type[Message]) -> tuple[Message | None, float]:
@@ -537,7 +543,7 @@ def why_idle(arm: ArmSnapshot, waiting: Mapping[str, str], fleet: FleetSnapshot,
 
     Args:
         waiting: Reasons of the waiting jobs, by job.
-        fleet: Which arms are paused or left out.
+        fleet: Which arms are paused, left out or take space.
         unserved: Why no arm gets a job.
     """
     if not arm.present or arm.job:
@@ -558,7 +564,9 @@ def why_idle(arm: ArmSnapshot, waiting: Mapping[str, str], fleet: FleetSnapshot,
         return "No job waits."
     named = next((f" {job}: {reason}" for job, reason in waiting.items() if arm.arm in reason), "")
     able = sum(job in waiting and score != JobScore() for job, score in arm.scores.items())
-    return f"It has bids for {able} of {len(waiting)} waiting jobs.{named}"
+    others = ", ".join(sorted(fleet.space.keys() - {arm.arm}))
+    in_way = f" Space is closed by {others}, which may be in its way." if others else ""
+    return f"It has bids for {able} of {len(waiting)} waiting jobs.{in_way}{named}"
 
 
 def _age_s(at_s: float | None, now_s: float) -> float | None:
@@ -624,5 +632,6 @@ def _arm_snapshot(name: str, arm: _Arm, now_s: float, speed: float | None, ended
         twin=info.twin if info else "",
         event=describe_event(event) if event else "",
         state_age_s=age_s,
+        state_gap_s=arm.gap_s,
         difficulty_age_s=difficulty_age_s,
     )

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import pytest
 from msgspec.structs import replace
 
-from fleet.bus.client import BusClient
+from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Ack,
@@ -275,6 +275,18 @@ def test_a_report_that_is_refused_again_and_again_is_logged_once(bus, caplog):
         assert bus.ask(key, report, Receipt).refusals
     (logged,) = (each.getMessage() for each in caplog.records if f"Award '{award}'" in each.getMessage())
     assert logged.startswith("Arm 'arm_0' reports in vain: Award")
+
+
+def test_quotes_under_no_valid_key_are_logged_at_a_limited_rate(bus, caplog):
+    node = bus.auctioneer()
+    for _ in range(3):
+        node._end_quotes(
+            "r",
+            frozenset(),
+            Replies(refused={"thermofleet/v4/f/arm/.dot/quote": "'…/.dot/quote' is no key of this bus."}),
+        )
+    logged = [each.getMessage() for each in caplog.records if each.getMessage().startswith("No quote")]
+    assert logged == ["No quote: '…/.dot/quote' is no key of this bus."]
 
 
 TWICE = ("Started", "Started")

@@ -178,12 +178,27 @@ def test_an_arm_without_a_job_says_why(change, waiting, paused, says):
     assert bool(arm.idle) == bool(says)
 
 
+def test_an_idle_arm_names_the_arms_that_may_be_in_its_way():
+    view = FleetView("f")
+    view.set_token("arm", "a", True)
+    view.update("a", state(), 0.0)
+    reply = Status("au", 1.0, (JobStatus("j", "waiting"),))
+    for space, says in (
+        ({"a": ("s",)}, ""),
+        ({"b": ("t",), "c": ("*",)}, "Space is closed by b, c, which may be in its way."),
+    ):
+        view.update_jobs(msgspec.structs.replace(reply, space=space), 0.0)
+        assert view.snapshot(0.0).arms[0].idle == f"It has bids for 0 of 1 waiting jobs. {says}".strip()
+
+
 @pytest.mark.parametrize(
     ("ticks", "doubled"),
     [
         ((100, 3, 101, 4, 102, 5), True),
         ((100, 101, 1, 2, 3, 4), False),  # one restart
-        ((7, 7, 7, 7, 7, 7), False),
+        ((1, 1, 2, 2, 3, 3, 4, 4), True),  # both have just started
+        ((7, 7, 7, 7, 7, 7), True),
+        ((9, 8, 7, 6, 5, 4), True),
     ],
 )
 def test_two_processes_under_the_name_of_one_arm_are_noticed(ticks, doubled):
@@ -192,10 +207,17 @@ def test_two_processes_under_the_name_of_one_arm_are_noticed(ticks, doubled):
     for number, tick in enumerate(ticks):
         view.update("a", state(tick=tick, time_s=float(number)), 0.5 * number)
     (arm,) = view.snapshot(3.0).arms
-    assert [each.what for each in check_arm(arm, None)] == doubled * [
-        "Two processes publish as arm a: its ticks go back and forth. Stop one."
-    ]
+    assert [each.what[:31] for each in check_arm(arm, None)] == doubled * ["The ticks of a do not count up:"]
     assert not view.snapshot(9.0).arms[0].doubled
+
+
+def test_the_time_between_the_last_two_states_is_known():
+    view = FleetView("f")
+    gaps_s = []
+    for second in (0.0, 10.0, 10.1):
+        view.update("a", state(), second)
+        gaps_s.append(view.snapshot(second).arms[0].state_gap_s)
+    assert gaps_s == [None, 10.0, pytest.approx(0.1)]
 
 
 def test_work_and_heat_are_sums_over_the_time_between_states():
