@@ -474,7 +474,7 @@ OUT = (event(10.0, "fault", job="", reason="joint 2 passed 75 °C"), event(590.0
         (OUT, 30.0, "arm_a was out after a fault"),
         (FAULTED, 30.0, "arm_a faulted during it at 0:02:30"),
         ((), 62.0, "arm_a was idle above the warning limit"),
-        ((), 30.0, "arm_a was idle: its place was taken, or the policy let it wait"),
+        ((), 30.0, "arm_a was idle: the job's place was taken, or the policy let the job wait"),
         ((), math.nan, "arm_a was absent, or no state was recorded"),
     ],
 )  # fmt: skip
@@ -489,6 +489,20 @@ def test_the_reason_of_a_late_job_is_what_took_most_of_its_wait(before, temp_c: 
         offers=tuple(offered(e.job, e.time_s, lengths_s[e.job]) for e in events if e.kind == "award"),
     )
     assert lateness_text(log, late_jobs(log)) == f"long-1 finished 1 min late: {reason}."
+
+
+def test_the_reason_of_a_late_job_names_only_the_arms_that_it_holds_for() -> None:
+    events = (event(0.0, "release", job="long-1"), *done("long-2", -10, 300, arm="arm_b"), *OUT)
+    at_work = replace(offered("long-2", -10, 310), arm="arm_b")
+    able = tuple(replace(offered("long-1", 600.0, 300.0), arm=arm) for arm in ("arm_a", "arm_b"))
+    log = replace(
+        log_of(telemetry(1000), ("arm_a", "arm_b"), (*events, *done("long-1", 600, 900, 60.0))),
+        jobs=(record("long-1", 840.0), record("long-2", 840.0)),
+        offers=(at_work, *able),
+    )
+    assert lateness_text(log, late_jobs(log)).endswith(": arm_a was out after a fault.")
+    out = replace(log, events=(*log.events, event(400.0, "fault", "arm_b", ""), event(500.0, "recover", "arm_b", "")))
+    assert lateness_text(out, late_jobs(out)).endswith(": arm_a and arm_b were out after a fault.")
 
 
 def test_late_jobs_turn_the_badge_red_and_abandoned_ones_come_last() -> None:
