@@ -552,6 +552,13 @@ def test_a_job_that_is_given_up_with_another_one_says_so() -> None:
     assert lateness_text(log, late_jobs(log)).endswith(": a job before it was given up.")
 
 
+def test_the_event_table_has_jobs_that_were_given_up() -> None:
+    why = "a job before it was given up"
+    text = page(events=(Event(time_s=9.0, kind="give_up", arm="", job="hold-001", reason=why),))
+    assert f"<td>job given up</td><td></td><td>hold-001</td><td>{why}</td>" in text
+    assert "1 × job given up" in text
+
+
 def test_a_shift_that_ended_with_its_last_job_says_so() -> None:
     for time_s, count in ((670.0, 1), (7200.0, 0)):
         card = {"status": "finished", "time_s": time_s, "scenario": {"horizon_s": 7200.0}}

@@ -410,6 +410,7 @@ NOTABLE = (
     "fault",
     "failure",
     "contact",
+    "give_up",
     "alarm",
     "pause",
     "resume",

@@ -18,7 +18,7 @@ SEVERITY = {
 """Kinds of events that are more than information."""
 MOST_NAMES = 6
 """Names in one sentence."""
-LABELS = {"lost": "claim lost", "return": "job returned", "recover": "recovered"}
+LABELS = {"lost": "claim lost", "return": "job returned", "give_up": "job given up", "recover": "recovered"}
 
 
 def clock(time_s: float, begin: datetime | None = None) -> str:
