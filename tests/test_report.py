@@ -580,6 +580,21 @@ def test_an_offer_names_the_break_or_the_pause_of_its_arm(at_s: float, why: str)
     assert offer_text(log.offers_behind("b-1", "arm_b", at_s)[1]).endswith(f"({why})")  # as a trace has it
 
 
+def test_other_offers_are_ordered_by_what_the_arms_predicted() -> None:
+    arms = ("arm_a", "b", "c", "d", "e", "f")
+    values = ((True, 0.5, 80.0), (True, 0.25, 60.0), (True, 0.25, 50.0), (True, None, None), (False, None, None))
+    others = [
+        replace(offered("b-1", 10.0, 60.0), arm=arm, awarded=False, feasible=feasible, p_saturation=p, peak_c=peak_c)
+        for arm, (feasible, p, peak_c) in zip(arms[1:], values, strict=True)
+    ]
+    log = replace(
+        log_of(telemetry(100, 6), arms, (event(10.0, "award", "arm_a", "b-1"),)),
+        offers=(offered("b-1", 10.0, 60.0), *others),
+    )
+    (cell,) = re.findall(r"<td>([^<]*cannot do it)</td>", report_html(log))
+    assert [part.partition(":")[0] for part in cell.split("; ")] == ["d", "c", "b", "e", "f"]
+
+
 def test_a_break_after_the_due_date_is_no_reason_to_be_late() -> None:
     pause = event(300.0, "break", job="", value=600.0), event(900.0, "break_end", job="")
     events = (event(0.0, "release", job="late-1"), *done("other-1", 1.0, 250.0), *pause)

@@ -628,19 +628,27 @@ def _award_section(log: ShiftLog) -> Iterator[Section]:
     rows, moments = list[tuple[str, ...]](), list[Moment]()
     for award in awards[:MOST_AWARDS]:
         winner = next(offer for offer in award if offer.awarded)
-        others = sorted((o for o in award if o is not winner), key=lambda o: (not o.free, o.p_saturation or 0.0, o.arm))
+        others = sorted((offer for offer in award if offer is not winner), key=_rank)
         cells = (winner.arm, offer_text(winner), offers_text(others[:MOST_OFFERS]))
         rows.append((clock(winner.time_s, log.begin), winner.job, *cells))
         moments.append(Moment(winner.time_s, winner.arm))
     left = f" The first {MOST_AWARDS} of {len(awards)} are listed; offers.parquet has all of them."
     how = (
         "P: probability that a motor passes its warning limit. Then the predicted peak, the difficulty d, and the "
-        "duration of the job; in brackets, why the arm could not take it then." + left * (len(awards) > MOST_AWARDS)
+        "duration of the job; in brackets, why the arm could not take it then. Other offers: free arms "
+        "first, then by P and predicted peak." + left * (len(awards) > MOST_AWARDS)
     )
-    head = ("time", "job", "awarded to", "its offer", "other offers, the best first")
+    head = ("time", "job", "awarded to", "its offer", "other offers")
     shown = Table(head=head, rows=tuple(rows), numbers=False).html(key="choices", moments=moments)
     details = ((f"The offers behind {len(awards)} award{'s' * (len(awards) > 1)}", shown),)
     yield Section(key="awards", title="Why each arm got its job", how=how, details=details)
+
+
+def _rank(offer: Offer) -> tuple[bool, bool, float, float, str]:
+    """Sort key of offers: free arms first, then by P(saturation) and predicted peak; unknown ones last of their kind,
+    infeasible ones last of all."""
+    p, peak_c = (math.inf if value is None else value for value in (offer.p_saturation, offer.peak_c))
+    return not offer.feasible, not offer.free, p, peak_c, offer.arm
 
 
 def _counted(counts: Mapping[str, int]) -> str:
