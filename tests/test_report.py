@@ -595,6 +595,18 @@ def test_other_offers_are_ordered_by_what_the_arms_predicted() -> None:
     assert [part.partition(":")[0] for part in cell.split("; ")] == ["d", "c", "b", "e", "f"]
 
 
+def test_the_temperatures_tell_a_failure_from_a_fault() -> None:
+    failure = event(400.0, "failure", job=""), event(600.0, "recover", job="")
+    log = log_of(
+        telemetry(1000), ("arm_a", "arm_b"), (event(10.0, "fault", job=""), event(99.0, "recover", job=""), *failure)
+    )
+    shown = drawn(report_html(log), 1)
+    lines = [shape for shape in shown["layout"]["shapes"] if shape.get("xref") == "x" and shape["type"] == "line"]
+    legend = {trace["name"]: trace["marker"]["color"] for trace in shown["data"] if trace["mode"] == "markers"}
+    assert legend == {"out after a fault": lines[0]["line"]["color"], "failed, not by heat": lines[1]["line"]["color"]}
+    assert len(set(legend.values())) == 2
+
+
 def test_a_break_after_the_due_date_is_no_reason_to_be_late() -> None:
     pause = event(300.0, "break", job="", value=600.0), event(900.0, "break_end", job="")
     events = (event(0.0, "release", job="late-1"), *done("other-1", 1.0, 250.0), *pause)
