@@ -15,8 +15,8 @@ from playwright.sync_api import Browser, Page, sync_playwright
 from fleet.arm.kinematics import REACH_M
 from scenarios.run.log import RunLog, open_run
 from scenarios.show.layout import LayoutReport, Reach, shoulder_m
+from scenarios.show.page import Head, Section
 from scenarios.show.page import Page as Report
-from scenarios.show.page import Section
 from scenarios.show.plan import plan_page
 from scenarios.show.run_page import runs_page
 from scenarios.spec.load import load
@@ -174,6 +174,18 @@ def test_a_narrow_table_breaks_no_short_word_and_scrolls_in_its_box(browser: Bro
     for word in ("2:05:09", "finished"):
         height_px = page.get_by_role("cell", name=word).evaluate(HEIGHT_OF_TEXT)
         assert height_px < 30, word  # one line
+    assert page.locator("html").evaluate("e => e.scrollWidth - e.clientWidth") <= 0
+    page.close()
+
+
+def test_a_narrow_table_of_figures_keeps_the_names_of_its_rows_and_tiles_wrap(browser: Browser) -> None:
+    rows = (("predictions", *["0.123 to 0.456"] * 6),)
+    table = Table(head=("", *("hottest", "coolest") * 3), rows=rows)
+    page = browser.new_page(viewport={"width": 390, "height": 850})
+    head = Head(tiles=(("hottest motor", f"70 °C {'x' * 54}", ""),))
+    page.set_content(Report(title="a", sections=[Section(tables=(table,))], head=head).html())
+    page.wait_for_selector(".figures dd")
+    assert page.get_by_role("cell", name="predictions").evaluate(HEIGHT_OF_TEXT) < 30  # one line
     assert page.locator("html").evaluate("e => e.scrollWidth - e.clientWidth") <= 0
     page.close()
 
