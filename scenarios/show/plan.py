@@ -15,7 +15,7 @@ from matplotlib.patches import Circle, Polygon
 from fleet.arm.kinematics import FOREARM_M, HAND_M, REACH_M, UPPER_ARM_M
 from fleet.env.render.picture import FAULT, INK, outlines
 from fleet.env.render.scene import mount_kind
-from scenarios.show.charts import COLOURS
+from scenarios.show.charts import COLOURS, shortened
 from scenarios.show.layout import LayoutReport, Reach, shoulder_m
 from scenarios.show.page import Badge, Head, Page, Section
 from scenarios.spec.schema import Scenario
@@ -25,6 +25,8 @@ Array = np.ndarray
 MOST_NAMED, MOST_NUMBERS, MOST_ROWS = 16, 24, 40
 """Arms whose mounts are described; rows of a matrix of exclusions with numbers; rows of the largest matrix drawn."""
 LEGEND = "reach {:.2f} m above the floor: dashed outstretched, filled with the tool pointing down"
+ARM_NAME, JOB_NAME = 16, 30
+"""Most characters of names in the picture; of jobs also places and scenarios."""
 LETTERS = 170
 """Of a line of problems, in a picture of full width."""
 
@@ -44,6 +46,8 @@ def draw_plan(file: Path, scenario: Scenario, report: LayoutReport) -> None:
     labels = _draw_cell(axes, scenario, report)
     if matrix:
         _draw_matrix(figure.add_subplot(grid[1]), tasks, report)
+    if len(tasks) > MOST_ROWS:
+        axes.set_xlabel(f"{axes.get_xlabel()}\nexclusions are not drawn: {len(tasks)} tasks, at most {MOST_ROWS}")
     figure.supxlabel("\n".join(lines), x=0.01, ha="left", color=FAULT, fontsize=9)
     figure.draw_without_rendering()  # decides the scale of the axes
     figure.set_layout_engine("none")
@@ -184,7 +188,8 @@ def _draw_cell(axes: Axes, scenario: Scenario, report: LayoutReport) -> list[Lab
         ahead = base + _ahead_m(turn)
         axes.annotate("", tuple(ahead[:2]), tuple(base[:2]), arrowprops={"arrowstyle": "-|>", "color": INK}, zorder=4)
         remark = _arm_remark(spec.name, report)
-        text = f"{spec.name}: {remark}" if remark else spec.name
+        name = shortened(spec.name, ARM_NAME)
+        text = f"{name}: {remark}" if remark else name
         if len(scenario.arms) <= MOST_NAMED:
             text += f"\n{mount_kind(robot.mount)}{f', {base[2]:g} m high' if base[2] else ''}"
         labels += [
@@ -195,15 +200,16 @@ def _draw_cell(axes: Axes, scenario: Scenario, report: LayoutReport) -> list[Lab
         for task in (task for task in report.at_once if task.arm == spec.name):
             axes.plot(*np.stack([shoulder, *(at[name] for name in task.places)])[:, :2].T, color=colour, zorder=2)
     for place in scenario.places:
-        remark = _place_remark(place.name, report)
-        colour, text = (FAULT, f"{place.name}: {remark}") if remark else (INK, place.name)
+        name, remark = shortened(place.name, JOB_NAME), _place_remark(place.name, report)
+        colour, text = (FAULT, f"{name}: {remark}") if remark else (INK, name)
         axes.plot(*place.position_m[:2], marker="X" if remark else "D", color=colour, markersize=7, zorder=4)
         labels.append(Label(text, np.array(place.position_m[:2]), colour))
     axes.set_aspect("equal")
     axes.autoscale_view()
     axes.grid(color="#e6e6e6", zorder=-1)
     axes.set(xlabel=f"x, m\n{LEGEND.format(height_m)}", ylabel="y, m")
-    axes.set_title(f"{scenario.name}: {len(report.at_once)} of {len(scenario.arms)} arms can work at once (lines)")
+    title = shortened(scenario.name, JOB_NAME)
+    axes.set_title(f"{title}: {len(report.at_once)} of {len(scenario.arms)} arms can work at once (lines)")
     return labels
 
 
@@ -220,7 +226,7 @@ def _draw_matrix(axes: Axes, tasks: Sequence[tuple[str, str]], report: LayoutRep
                 size = 7.0 if len(tasks) <= MOST_NUMBERS / 2 else 5.0
                 axes.text(b, a, text, ha="center", va="center", fontsize=size, color=ink)
     axes.imshow(share, cmap="Blues", vmin=0.0, vmax=1.0)
-    names = [f"{arm}: {job}" for arm, job in tasks]
+    names = [f"{shortened(arm, ARM_NAME)}: {shortened(job, JOB_NAME)}" for arm, job in tasks]
     axes.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
     axes.set_yticks(range(len(names)), names, fontsize=8)
     axes.set_title("Exclusions: % of the pairs of plans")

@@ -456,6 +456,15 @@ def test_problems_are_reported_all_at_once_and_drawn_with_the_distance_that_lack
     assert (tmp_path / "cell.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.filterwarnings("error")  # matplotlib's, that the names leave no room for the figure
+def test_the_picture_of_a_cell_has_room_for_long_names(tmp_path):
+    arms = [dict(each, name=f"{each['name']}{'_' * 50}") for each in APART]
+    scenario = cell(*arms, places={"a" * 54: (0.0, 0.0, 0.25), "b" * 54: (0.0, 0.12, 0.25)})
+    report = layout_report(scenario)
+    assert report.exclusions
+    draw_plan(tmp_path / "cell.png", scenario, report)
+
+
 @pytest.mark.ci_slow
 def test_the_command_shows_the_cell_and_fails_if_there_are_problems(tmp_path, thermofleet):
     picture = tmp_path / "new" / "cell.png"

@@ -90,7 +90,7 @@ function startLayout() {
       set(arm.arrow, { x1: x, y1: -y, x2: x + c, y2: -y - d });
       set(arm.body, { x: x - text, y: -y - text });
       set(arm.tip, { cx: x + c, cy: -y - d });
-      set(arm.label, { x: x + text * 1.3, y: -y + text * 2.1 });
+      set(arm.label, { x, y: -y + text * 2.1 });
       arm.mark.classList.toggle("unable", checked && arm.remark !== "");
       arm.label.textContent = checked && arm.remark ? `${arm.name}: ${arm.remark}` : arm.name;
     }
