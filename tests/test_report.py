@@ -35,7 +35,7 @@ from scenarios.show.run_page import (
     verdict,
 )
 from scenarios.show.timeline import shift_charts, stream_of
-from scenarios.show.words import duration, offer_text
+from scenarios.show.words import duration, offer_text, value_text
 
 ARMS = ("arm_0", "arm_1")
 HOSTILE = '</script><img src="https://evil.example/x"><b>-001'
@@ -550,6 +550,10 @@ def test_a_job_that_is_given_up_with_another_one_says_so() -> None:
     events = (event(0.0, "release", job="a"), event(300.0, "give_up", "", "a", reason="a job before it was given up"))
     log = replace(log_of(telemetry(1000), ("arm_a", "arm_b"), events), jobs=(record("a", 500.0, "given_up"),))
     assert lateness_text(log, late_jobs(log)).endswith(": a job before it was given up.")
+
+
+def test_an_empty_list_of_a_card_is_none() -> None:
+    assert value_text({"loss": 0.0, "partitions": []}) == "loss 0, partitions none"
 
 
 def test_the_event_table_has_jobs_that_were_given_up() -> None:
