@@ -35,7 +35,7 @@ from scenarios.show.run_page import (
     verdict,
 )
 from scenarios.show.timeline import shift_charts, stream_of
-from scenarios.show.words import duration, offer_text
+from scenarios.show.words import duration, offer_text, value_text
 
 ARMS = ("arm_0", "arm_1")
 HOSTILE = '</script><img src="https://evil.example/x"><b>-001'
@@ -474,7 +474,7 @@ OUT = (event(10.0, "fault", job="", reason="joint 2 passed 75 °C"), event(590.0
         (OUT, 30.0, "arm_a was out after a fault"),
         (FAULTED, 30.0, "arm_a faulted during it at 0:02:30"),
         ((), 62.0, "arm_a was idle above the warning limit"),
-        ((), 30.0, "arm_a was idle: its place was taken, or the policy let it wait"),
+        ((), 30.0, "arm_a was idle: the job's place was taken, or the policy let the job wait"),
         ((), math.nan, "arm_a was absent, or no state was recorded"),
     ],
 )  # fmt: skip
@@ -489,6 +489,20 @@ def test_the_reason_of_a_late_job_is_what_took_most_of_its_wait(before, temp_c: 
         offers=tuple(offered(e.job, e.time_s, lengths_s[e.job]) for e in events if e.kind == "award"),
     )
     assert lateness_text(log, late_jobs(log)) == f"long-1 finished 1 min late: {reason}."
+
+
+def test_the_reason_of_a_late_job_names_only_the_arms_that_it_holds_for() -> None:
+    events = (event(0.0, "release", job="long-1"), *done("long-2", -10, 300, arm="arm_b"), *OUT)
+    at_work = replace(offered("long-2", -10, 310), arm="arm_b")
+    able = tuple(replace(offered("long-1", 600.0, 300.0), arm=arm) for arm in ("arm_a", "arm_b"))
+    log = replace(
+        log_of(telemetry(1000), ("arm_a", "arm_b"), (*events, *done("long-1", 600, 900, 60.0))),
+        jobs=(record("long-1", 840.0), record("long-2", 840.0)),
+        offers=(at_work, *able),
+    )
+    assert lateness_text(log, late_jobs(log)).endswith(": arm_a was out after a fault.")
+    out = replace(log, events=(*log.events, event(400.0, "fault", "arm_b", ""), event(500.0, "recover", "arm_b", "")))
+    assert lateness_text(out, late_jobs(out)).endswith(": arm_a and arm_b were out after a fault.")
 
 
 def test_late_jobs_turn_the_badge_red_and_abandoned_ones_come_last() -> None:
@@ -538,6 +552,17 @@ def test_a_job_that_is_given_up_with_another_one_says_so() -> None:
     assert lateness_text(log, late_jobs(log)).endswith(": a job before it was given up.")
 
 
+def test_an_empty_list_of_a_card_is_none() -> None:
+    assert value_text({"loss": 0.0, "partitions": []}) == "loss 0, partitions none"
+
+
+def test_the_event_table_has_jobs_that_were_given_up() -> None:
+    why = "a job before it was given up"
+    text = page(events=(Event(time_s=9.0, kind="give_up", arm="", job="hold-001", reason=why),))
+    assert f"<td>job given up</td><td></td><td>hold-001</td><td>{why}</td>" in text
+    assert "1 × job given up" in text
+
+
 def test_a_shift_that_ended_with_its_last_job_says_so() -> None:
     for time_s, count in ((670.0, 1), (7200.0, 0)):
         card = {"status": "finished", "time_s": time_s, "scenario": {"horizon_s": 7200.0}}
@@ -557,6 +582,33 @@ def test_an_offer_names_the_break_or_the_pause_of_its_arm(at_s: float, why: str)
     )
     assert f"<td>arm_a: P 0.25, 1 min ({why})</td>" in report_html(log)
     assert offer_text(log.offers_behind("b-1", "arm_b", at_s)[1]).endswith(f"({why})")  # as a trace has it
+
+
+def test_other_offers_are_ordered_by_what_the_arms_predicted() -> None:
+    arms = ("arm_a", "b", "c", "d", "e", "f")
+    values = ((True, 0.5, 80.0), (True, 0.25, 60.0), (True, 0.25, 50.0), (True, None, None), (False, None, None))
+    others = [
+        replace(offered("b-1", 10.0, 60.0), arm=arm, awarded=False, feasible=feasible, p_saturation=p, peak_c=peak_c)
+        for arm, (feasible, p, peak_c) in zip(arms[1:], values, strict=True)
+    ]
+    log = replace(
+        log_of(telemetry(100, 6), arms, (event(10.0, "award", "arm_a", "b-1"),)),
+        offers=(offered("b-1", 10.0, 60.0), *others),
+    )
+    (cell,) = re.findall(r"<td>([^<]*cannot do it)</td>", report_html(log))
+    assert [part.partition(":")[0] for part in cell.split("; ")] == ["d", "c", "b", "e", "f"]
+
+
+def test_the_temperatures_tell_a_failure_from_a_fault() -> None:
+    failure = event(400.0, "failure", job=""), event(600.0, "recover", job="")
+    log = log_of(
+        telemetry(1000), ("arm_a", "arm_b"), (event(10.0, "fault", job=""), event(99.0, "recover", job=""), *failure)
+    )
+    shown = drawn(report_html(log), 1)
+    lines = [shape for shape in shown["layout"]["shapes"] if shape.get("xref") == "x" and shape["type"] == "line"]
+    legend = {trace["name"]: trace["marker"]["color"] for trace in shown["data"] if trace["mode"] == "markers"}
+    assert legend == {"out after a fault": lines[0]["line"]["color"], "failed, not by heat": lines[1]["line"]["color"]}
+    assert len(set(legend.values())) == 2
 
 
 def test_a_break_after_the_due_date_is_no_reason_to_be_late() -> None:

@@ -404,6 +404,8 @@ def report_command(
         check_file(out, (".html",), overwrite=True)
     if (folder / CARD).exists():
         raise FleetError(f"'{folder}' is of `thermofleet compare`: open its index.html in a browser.")
+    if (folder / "fleet.json").exists() and (folder / "recording").is_dir():
+        raise FleetError(f"'{folder}' is of `thermofleet live`: give '{folder / 'recording'}'.")
     if trace is not None:
         from scenarios.live.trace import thread_of, thread_table
 

@@ -557,7 +557,12 @@ def report_command(
     log: Path | None = options.LOG,
     out: Path = option("Folder of report.html and report.json.", Path("runs/twin_report")),
     arm: str | None = options.SCENARIO_ARM,
-    seeds: int = option("Number of training seeds; the report gives the spread of their results.", 3, low=1, high=100),
+    seeds: int = option(
+        "Number of training seeds; the report gives the spread of their results. The chapter on epochs always has 3.",
+        3,
+        low=1,
+        high=100,
+    ),
     skip_damaged: bool = options.SKIP_DAMAGED,
     overwrite: bool = options.OVERWRITE,
     as_json: bool = options.JSON,

@@ -64,11 +64,16 @@ def named_rows(names: Sequence[str], **more: Any) -> Trace:
     return AXIS | ticks | {"automargin": True, "showgrid": False} | more
 
 
+def shortened(text: str, most: int) -> str:
+    """Text with its start and end if it has more than `most` characters."""
+    return f"{text[: most - most // 2 - 1]}…{text[-(most // 2) :]}" if len(text) > most else text
+
+
 def plain(text: str, most: int | None = None) -> str:
     """Text escaped for Plotly, which interprets some HTML and `%{…}`; with `most`, its start and end are kept."""
     shown = visible(text)
-    if most is not None and len(shown) > most:
-        shown = f"{shown[: most - most // 2 - 1]}…{shown[-(most // 2) :]}"
+    if most is not None:
+        shown = shortened(shown, most)
     return html.escape(shown, quote=False).replace("%{", "%&#123;")
 
 

@@ -124,12 +124,8 @@ def layout_parts(scenario: Scenario, report: LayoutReport) -> list[Table | str]:
         numbers=False,
     )
     reasons = Table(
-        head=("cannot do", "lacks, m", "reason"),
-        rows=tuple(
-            (f"{entry.arm} at {entry.place}", f"{entry.lacks_m:.2f}" if entry.lacks_m else "", entry.reason)
-            for entry in report.reach
-            if entry.reason
-        ),
+        head=("cannot do", "reason"),
+        rows=tuple((f"{entry.arm} at {entry.place}", entry.reason) for entry in report.reach if entry.reason),
         numbers=False,
     )
     shared = [pair for pair in report.exclusions if not pair.same_place]
@@ -253,13 +249,16 @@ def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | str
     points = [f"{c:g} °C at {t / 3600:g} h" for t, c in scenario.ambient.points]
     ambient = ", ".join(points) if len(points) > 1 else f"{scenario.ambient.at(np.zeros(1))[0]:g} °C"
     people = scenario.people
+    able = f"{load.able:.0%} of the arms can do a job (mean over the jobs)"
+    if not load.able:  # every job that arrives is for some arm
+        able = f"No job arrives in the shifts of {SEEDS} seeds: compare the arrivals of the jobs with horizon_s"
     head = (
         f"{scenario.name}: {scenario.description}\n{scenario.horizon_s / 3600:g} h, a decision every "
         f"{scenario.decision_interval_s:g} s, {scenario.slots} slots, ambient {ambient}\n"
         f"{REGIMES[load.regime]}\nthermal load factor "
         f"{load.thermal:.2f} for the best assignment that the arms have time for, {load.blind:.2f} for an equal split; "
         f"time load {load.time:.2f} (mean of {SEEDS} seeds; 1 is what the fleet can do)\n"
-        f"{load.able:.0%} of the arms can do a job (mean over the jobs)\n"
+        f"{able}\n"
         f"{_fault_cost(scenario)}\n"
         f"people touch an arm for up to {people.contact_s:g} s: a surface of {people.burn_c:g} °C or more burns"
         f"{_absences(scenario)}"

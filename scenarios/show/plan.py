@@ -15,8 +15,8 @@ from matplotlib.patches import Circle, Polygon
 from fleet.arm.kinematics import FOREARM_M, HAND_M, REACH_M, UPPER_ARM_M
 from fleet.env.render.picture import FAULT, INK, outlines
 from fleet.env.render.scene import mount_kind
-from scenarios.show.charts import COLOURS
-from scenarios.show.layout import LayoutReport, shoulder_m
+from scenarios.show.charts import COLOURS, shortened
+from scenarios.show.layout import LayoutReport, Reach, shoulder_m
 from scenarios.show.page import Badge, Head, Page, Section
 from scenarios.spec.schema import Scenario
 from scenarios.table import render
@@ -25,6 +25,8 @@ Array = np.ndarray
 MOST_NAMED, MOST_NUMBERS, MOST_ROWS = 16, 24, 40
 """Arms whose mounts are described; rows of a matrix of exclusions with numbers; rows of the largest matrix drawn."""
 LEGEND = "reach {:.2f} m above the floor: dashed outstretched, filled with the tool pointing down"
+ARM_NAME, JOB_NAME = 16, 30
+"""Most characters of names in the picture; of jobs also places and scenarios."""
 LETTERS = 170
 """Of a line of problems, in a picture of full width."""
 
@@ -44,6 +46,8 @@ def draw_plan(file: Path, scenario: Scenario, report: LayoutReport) -> None:
     labels = _draw_cell(axes, scenario, report)
     if matrix:
         _draw_matrix(figure.add_subplot(grid[1]), tasks, report)
+    if len(tasks) > MOST_ROWS:
+        axes.set_xlabel(f"{axes.get_xlabel()}\nexclusions are not drawn: {len(tasks)} tasks, at most {MOST_ROWS}")
     figure.supxlabel("\n".join(lines), x=0.01, ha="left", color=FAULT, fontsize=9)
     figure.draw_without_rendering()  # decides the scale of the axes
     figure.set_layout_engine("none")
@@ -65,20 +69,53 @@ def plan_page(scenario: Scenario, report: LayoutReport) -> str:
                 "base": spec.position_m,
                 "tilt": spec.tilt_deg,
                 "radii": _radii_m(shoulder, height_m),
+                "remark": _arm_remark(spec.name, report),
                 **{name: each.tolist() for name, each in points.items()},
             }
         )
     plan = {
         "reach_m": REACH_M,
         "arms": arms,
-        "places": [{"name": place.name, "at": place.position_m} for place in scenario.places],
+        "places": [
+            {
+                "name": place.name,
+                "at": place.position_m,
+                "remark": _place_remark(place.name, report),
+                "able": [each.arm for each in _of_place(place.name, report) if each.payload_kg is not None],
+            }
+            for place in scenario.places
+        ],
         "fixtures": [outline.tolist() for fixture in scenario.fixtures for outline in outlines(fixture)],
     }
     drag = "Drag an arm by its base, or turn it by the tip of its arrow; with the arrow keys it moves by 1 cm."
+    red = (
+        "Red until an arm is moved: places where no arm can work, and arms that can do no job. Afterwards, only the "
+        "reach of the outstretched arm is judged."
+    )
     problems = [Badge(problem, good=False) for problem in report.problems]
-    head = Head(remarks=(f"{drag} The {LEGEND.format(height_m)}.",), badges=problems)
+    head = Head(remarks=(f"{drag} The {LEGEND.format(height_m)}.", red), badges=problems)
     cell = Section(key="cell", title="Cell", html=render("layout.html"))
     return Page(title=f"Plan of {scenario.name}", sections=[cell], head=head, plan=plan, narrow=False).html()
+
+
+def _of_place(place: str, report: LayoutReport) -> list[Reach]:
+    """What each arm can do at a place."""
+    return [each for each in report.reach if each.place == place]
+
+
+def _place_remark(place: str, report: LayoutReport) -> str:
+    """Why no arm can work at a place; "" if an arm can."""
+    entries = _of_place(place, report)
+    if any(each.payload_kg is not None for each in entries):
+        return ""
+    lacks_m = min((each.lacks_m for each in entries), default=0.0)
+    return f"lacks {lacks_m:.2f} m" if lacks_m else "no arm can work here"
+
+
+def _arm_remark(arm: str, report: LayoutReport) -> str:
+    """That an arm can do no job; "" if it can do one."""
+    able = any(each.payload_kg is not None for each in report.reach if each.arm == arm)
+    return "" if able else "can do no job"
 
 
 def _height_m(scenario: Scenario) -> float:
@@ -150,30 +187,29 @@ def _draw_cell(axes: Axes, scenario: Scenario, report: LayoutReport) -> list[Lab
         axes.plot(*base[:2], marker="s", color=colour, markersize=9, zorder=3)
         ahead = base + _ahead_m(turn)
         axes.annotate("", tuple(ahead[:2]), tuple(base[:2]), arrowprops={"arrowstyle": "-|>", "color": INK}, zorder=4)
-        able = any(each.payload_kg is not None for each in report.reach if each.arm == spec.name)
-        text = spec.name if able else f"{spec.name}: can do no job"
+        remark = _arm_remark(spec.name, report)
+        name = shortened(spec.name, ARM_NAME)
+        text = f"{name}: {remark}" if remark else name
         if len(scenario.arms) <= MOST_NAMED:
             text += f"\n{mount_kind(robot.mount)}{f', {base[2]:g} m high' if base[2] else ''}"
         labels += [
-            Label(text, base[:2], INK if able else FAULT),
+            Label(text, base[:2], FAULT if remark else INK),
             Label("", ahead[:2], INK),
             Label("", shoulder[:2], INK),
         ]
         for task in (task for task in report.at_once if task.arm == spec.name):
             axes.plot(*np.stack([shoulder, *(at[name] for name in task.places)])[:, :2].T, color=colour, zorder=2)
     for place in scenario.places:
-        own = [each for each in report.reach if each.place == place.name]
-        able = any(each.payload_kg is not None for each in own)
-        lacks_m = min((each.lacks_m for each in own), default=0.0)
-        why = f" lacks {lacks_m:.2f} m" if lacks_m else " no arm can work here"
-        colour = INK if able else FAULT
-        axes.plot(*place.position_m[:2], marker="D" if able else "X", color=colour, markersize=7, zorder=4)
-        labels.append(Label(place.name + ("" if able else f":{why}"), np.array(place.position_m[:2]), colour))
+        name, remark = shortened(place.name, JOB_NAME), _place_remark(place.name, report)
+        colour, text = (FAULT, f"{name}: {remark}") if remark else (INK, name)
+        axes.plot(*place.position_m[:2], marker="X" if remark else "D", color=colour, markersize=7, zorder=4)
+        labels.append(Label(text, np.array(place.position_m[:2]), colour))
     axes.set_aspect("equal")
     axes.autoscale_view()
     axes.grid(color="#e6e6e6", zorder=-1)
     axes.set(xlabel=f"x, m\n{LEGEND.format(height_m)}", ylabel="y, m")
-    axes.set_title(f"{scenario.name}: {len(report.at_once)} of {len(scenario.arms)} arms can work at once (lines)")
+    title = shortened(scenario.name, JOB_NAME)
+    axes.set_title(f"{title}: {len(report.at_once)} of {len(scenario.arms)} arms can work at once (lines)")
     return labels
 
 
@@ -190,7 +226,7 @@ def _draw_matrix(axes: Axes, tasks: Sequence[tuple[str, str]], report: LayoutRep
                 size = 7.0 if len(tasks) <= MOST_NUMBERS / 2 else 5.0
                 axes.text(b, a, text, ha="center", va="center", fontsize=size, color=ink)
     axes.imshow(share, cmap="Blues", vmin=0.0, vmax=1.0)
-    names = [f"{arm}: {job}" for arm, job in tasks]
+    names = [f"{shortened(arm, ARM_NAME)}: {shortened(job, JOB_NAME)}" for arm, job in tasks]
     axes.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
     axes.set_yticks(range(len(names)), names, fontsize=8)
     axes.set_title("Exclusions: % of the pairs of plans")

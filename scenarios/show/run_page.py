@@ -310,12 +310,16 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
     waits_s = _arm_time(log, able, begin_s, end_s, halts)
     if all(each.start_s >= late.due_s for each in log.plan.breaks):
         waits_s.pop(PAUSED)  # it was late before
-    most = max(waits_s, key=lambda why: waits_s[why])
-    if not waits_s[most]:
+    most = max(waits_s, key=lambda why: sum(waits_s[why].values()))
+    arms = [arm for arm, time_s in waits_s[most].items() if time_s > 0]
+    if not arms:
         return f"what {names_text(able)} did meanwhile is not recorded"
-    if most:
-        return most if most in halts else f"{names_text(able)} {most}"
-    return _passed(log, late, able, begin_s, end_s)
+    if not most:
+        return _passed(log, late, able, begin_s, end_s)
+    if most in halts:
+        return most
+    be = "" if most == PAUSED else "were " if len(arms) > 1 else "was "
+    return f"{names_text(arms)} {be}{most}"
 
 
 def _absence_in(span: JobSpan, event: Event) -> bool:
@@ -365,31 +369,30 @@ def _passed(log: ShiftLog, late: LateJob, able: Sequence[str], begin_s: float, e
 
 def _arm_time(
     log: ShiftLog, able: Sequence[str], begin_s: float, end_s: float, halts: Mapping[str, Halt]
-) -> dict[str, float]:
-    """Time of the arms that can do a job between its release and its award, s, by what they did, or by what kept them
+) -> dict[str, dict[str, float]]:
+    """Time of each arm that can do a job between its release and its award, s, by what the arm did, or by what kept it
     from getting jobs; "": later jobs."""
-    were = "were" if len(able) > 1 else "was"
-    earlier, out = f"{were} at work since before its release", f"{were} out after a fault"
-    failed, paused = f"{were} out after a failure", PAUSED
-    absent = f"{were} absent, or no state was recorded"
-    hot, idle = f"{were} idle above the warning limit", f"{were} idle: its place was taken, or the policy let it wait"
-    time_s: dict[str, float] = dict.fromkeys((*halts, "", earlier, out, failed, paused, hot, idle, absent), 0.0)
+    earlier, out, failed = "at work since before its release", "out after a fault", "out after a failure"
+    hot, idle = "idle above the warning limit", "idle: the job's place was taken, or the policy let the job wait"
+    absent = "absent, or no state was recorded"
+    whys = (*halts, "", earlier, out, failed, PAUSED, hot, idle, absent)
+    time_s = {why: dict.fromkeys(able, 0.0) for why in whys}
     at_s = log.readings.time_s
     step_s = float(np.median(np.diff(at_s))) if len(at_s) > 1 else 0.0
     for arm in able:
         spans = [(s, earlier if s.start_s < begin_s else "") for s in log.plan.assignments if s.arm == arm]
         spans += [(each, out if each.kind == "fault" else failed) for each in log.plan.outages if each.arm == arm]
-        spans += [(each, paused) for each in log.plan.breaks if each.arm == arm]
+        spans += [(each, PAUSED) for each in log.plan.breaks if each.arm == arm]
         kept = [(halt, why) for why, halt in halts.items() if halt.arm in ("", arm)]
         free = (at_s >= begin_s) & (at_s < end_s)
         for span, why in [*kept, *spans]:
             halted_s = 0.0 if why in halts else sum(_common_s(begin_s, end_s, span, halt) for halt, _ in kept)
-            time_s[why] += _common_s(begin_s, end_s, span) - halted_s
+            time_s[why][arm] += _common_s(begin_s, end_s, span) - halted_s
             free &= (at_s < span.start_s) | (at_s >= span.end_s)
         peak_c = np.fmax.reduce(log.readings.temp_c[free, log.arms.index(arm)], axis=-1, initial=-math.inf)
-        time_s[hot] += step_s * float((peak_c >= log.limits.warning_c).sum())
-        time_s[absent] += step_s * float(np.isneginf(peak_c).sum())
-        time_s[idle] += step_s * float((np.isfinite(peak_c) & (peak_c < log.limits.warning_c)).sum())
+        time_s[hot][arm] += step_s * float((peak_c >= log.limits.warning_c).sum())
+        time_s[absent][arm] += step_s * float(np.isneginf(peak_c).sum())
+        time_s[idle][arm] += step_s * float((np.isfinite(peak_c) & (peak_c < log.limits.warning_c)).sum())
     return time_s
 
 
@@ -407,6 +410,7 @@ NOTABLE = (
     "fault",
     "failure",
     "contact",
+    "give_up",
     "alarm",
     "pause",
     "resume",
@@ -624,19 +628,27 @@ def _award_section(log: ShiftLog) -> Iterator[Section]:
     rows, moments = list[tuple[str, ...]](), list[Moment]()
     for award in awards[:MOST_AWARDS]:
         winner = next(offer for offer in award if offer.awarded)
-        others = sorted((o for o in award if o is not winner), key=lambda o: (not o.free, o.p_saturation or 0.0, o.arm))
+        others = sorted((offer for offer in award if offer is not winner), key=_rank)
         cells = (winner.arm, offer_text(winner), offers_text(others[:MOST_OFFERS]))
         rows.append((clock(winner.time_s, log.begin), winner.job, *cells))
         moments.append(Moment(winner.time_s, winner.arm))
     left = f" The first {MOST_AWARDS} of {len(awards)} are listed; offers.parquet has all of them."
     how = (
         "P: probability that a motor passes its warning limit. Then the predicted peak, the difficulty d, and the "
-        "duration of the job; in brackets, why the arm could not take it then." + left * (len(awards) > MOST_AWARDS)
+        "duration of the job; in brackets, why the arm could not take it then. Other offers: free arms "
+        "first, then by P and predicted peak." + left * (len(awards) > MOST_AWARDS)
     )
-    head = ("time", "job", "awarded to", "its offer", "other offers, the best first")
+    head = ("time", "job", "awarded to", "its offer", "other offers")
     shown = Table(head=head, rows=tuple(rows), numbers=False).html(key="choices", moments=moments)
     details = ((f"The offers behind {len(awards)} award{'s' * (len(awards) > 1)}", shown),)
     yield Section(key="awards", title="Why each arm got its job", how=how, details=details)
+
+
+def _rank(offer: Offer) -> tuple[bool, bool, float, float, str]:
+    """Sort key of offers: free arms first, then by P(saturation) and predicted peak; unknown ones last of their kind,
+    infeasible ones last of all."""
+    p, peak_c = (math.inf if value is None else value for value in (offer.p_saturation, offer.peak_c))
+    return not offer.feasible, not offer.free, p, peak_c, offer.arm
 
 
 def _counted(counts: Mapping[str, int]) -> str:

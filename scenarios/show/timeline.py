@@ -21,6 +21,8 @@ Span = TypeVar("Span", JobSpan, Outage)
 
 STREAM_COLOURS = ("#4477aa", "#ddaa33", "#228833", "#aa4499", "#66ccee", "#997755", "#999933", "#555566")
 FAILURE, BREAK = "#444444", "#8a8a8a"
+OUTAGES = (("fault", "out after a fault", FAULT), ("failure", "failed, not by heat", FAILURE))
+"""Kinds of outages that are no breaks, with their names and colours in legends."""
 BAR = {"type": "bar", "orientation": "h"}
 BAR_HEIGHT, BREAK_HEIGHT = 0.62, 0.24
 """In rows; a fault may last into a break."""
@@ -107,11 +109,8 @@ def _gantt(log: ShiftLog, unit_s: float) -> list[Trace]:
     """Work, outages and marks; the row of an arm is its index, times are in units of `unit_s`."""
     outages, arms = log.plan.outages, log.arms
     traces = _work_bars(log, unit_s)
-    for name, spans, colour, shape in (
-        ("out after a fault", [each for each in outages if each.kind == "fault"], FAULT, "x"),
-        ("failed, not by heat", [each for each in outages if each.kind == "failure"], FAILURE, "x"),
-        ("break", log.plan.breaks, BREAK, "\\"),
-    ):
+    out = [(name, [each for each in outages if each.kind == kind], colour, "x") for kind, name, colour in OUTAGES]
+    for name, spans, colour, shape in (*out, ("break", log.plan.breaks, BREAK, "\\")):
         if spans:
             look = {"color": colour, "opacity": 0.8, "line": {"width": 0}, "pattern": HATCH | {"shape": shape}}
             bars = _bars(name, spans, _outage_text, log, unit_s, look)
@@ -300,16 +299,18 @@ def _time_title(log: ShiftLog, unit: str) -> str:
 
 
 def _outages(outages: Sequence[Outage], arms: Sequence[str], unit_s: float) -> list[dict[str, Any]]:
-    """Faults as vertical lines and outages as shade in the lane of their arm; arms without a lane are left out."""
+    """Begins of outages as vertical lines and outages as shade in the lane of their arm, of faults in another colour
+    than of failures; arms without a lane are left out."""
     shapes = []
     for o in outages:
         if o.arm not in arms:
             continue
         lane = {"xref": "x", "yref": f"y{arms.index(o.arm) + 1} domain", "y0": 0, "y1": 1}
+        colour = FAULT if o.kind == "fault" else FAILURE
         start, end = round(o.start_s / unit_s, 5), round(o.end_s / unit_s, 5)
         shapes += [
-            lane | {"type": "rect", "x0": start, "x1": end, "fillcolor": FAULT, "opacity": 0.10, "line": {"width": 0}},
-            lane | {"type": "line", "x0": start, "x1": start, "line": {"color": FAULT, "width": 1.5}},
+            lane | {"type": "rect", "x0": start, "x1": end, "fillcolor": colour, "opacity": 0.10, "line": {"width": 0}},
+            lane | {"type": "line", "x0": start, "x1": start, "line": {"color": colour, "width": 1.5}},
         ]
     return shapes
 
@@ -339,4 +340,9 @@ def _temperatures(log: ShiftLog, lanes: Sequence[int], time: Trace, unit: str, u
             traces.append(charts.curve(name, telemetry.time_s / unit_s, value, line, most=points, **place))
     if count < len(log.arms):  # the page may show any other arm in the last lane: its traces, and its title
         layout["meta"] = {"lane_traces": list(range(len(traces) - JOINTS, len(traces))), "lane_title": 3 * count - 1}
+    for kind, name, colour in OUTAGES:
+        if any(each.kind == kind and each.arm in arms for each in log.plan.outages):
+            look = {"symbol": "square", "size": 10, "color": colour, "opacity": 0.5}
+            entry = {"type": "scatter", "mode": "markers", "name": name, "x": [None], "y": [None], "marker": look}
+            traces.append(entry | {"showlegend": True})
     return {"data": traces, "layout": layout}

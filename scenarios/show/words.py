@@ -18,7 +18,7 @@ SEVERITY = {
 """Kinds of events that are more than information."""
 MOST_NAMES = 6
 """Names in one sentence."""
-LABELS = {"lost": "claim lost", "return": "job returned", "recover": "recovered"}
+LABELS = {"lost": "claim lost", "return": "job returned", "give_up": "job given up", "recover": "recovered"}
 
 
 def clock(time_s: float, begin: datetime | None = None) -> str:
@@ -49,12 +49,15 @@ def names_text(names: Sequence[str]) -> str:
 
 
 def value_text(value: object) -> str:
-    """A value of a card: numbers with six digits, keys before their values, only the length of nested lists."""
+    """A value of a card: numbers with six digits, keys before their values, only the length of nested lists, and
+    none for an empty one."""
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {value_text(inner)}" for key, inner in value.items())
     if isinstance(value, list | tuple):
+        if not value:
+            return "none"
         nested = any(isinstance(inner, Mapping | list | tuple) for inner in value)
         return f"list of {len(value)}" if nested else ", ".join(map(value_text, value))
     return str(value)

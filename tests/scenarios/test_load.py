@@ -24,7 +24,7 @@ from fleet.events import Event
 from fleet.job import Fixture
 from scenarios.prepare.fleet import prepare, prepare_arm
 from scenarios.run.shift import run
-from scenarios.show.layout import layout_report
+from scenarios.show.layout import describe, layout_report
 from scenarios.show.plan import draw_plan
 from scenarios.show.run_page import figure_table
 from scenarios.spec.jobs import all_works, draw_jobs, rehearsal_works, works_of
@@ -454,6 +454,24 @@ def test_problems_are_reported_all_at_once_and_drawn_with_the_distance_that_lack
     assert lacks_m["west", "middle"] == 0.0
     draw_plan(tmp_path / "cell.png", scenario, report)
     assert (tmp_path / "cell.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_scenario_in_which_no_job_arrives_says_so():
+    scenario = cell(APART[0], places={"left": BESIDE["left"]})
+    (stream,) = scenario.jobs
+    rare = replace(scenario, jobs=(replace(stream, arrivals=Arrivals(kind="poisson", every_s=1e9)),))
+    assert "of the arms can do a job" in str(describe(scenario)[0])
+    assert "\nNo job arrives in the shifts of 5 seeds: " in str(describe(rare)[0])
+    assert "of the arms can do a job" not in str(describe(rare)[0])
+
+
+@pytest.mark.filterwarnings("error")  # matplotlib's, that the names leave no room for the figure
+def test_the_picture_of_a_cell_has_room_for_long_names(tmp_path):
+    arms = [dict(each, name=f"{each['name']}{'_' * 50}") for each in APART]
+    scenario = cell(*arms, places={"a" * 54: (0.0, 0.0, 0.25), "b" * 54: (0.0, 0.12, 0.25)})
+    report = layout_report(scenario)
+    assert report.exclusions
+    draw_plan(tmp_path / "cell.png", scenario, report)
 
 
 @pytest.mark.ci_slow

@@ -14,9 +14,9 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 from fleet.arm.kinematics import REACH_M
 from scenarios.run.log import RunLog, open_run
-from scenarios.show.layout import LayoutReport, shoulder_m
+from scenarios.show.layout import LayoutReport, Reach, shoulder_m
+from scenarios.show.page import Head, Section
 from scenarios.show.page import Page as Report
-from scenarios.show.page import Section
 from scenarios.show.plan import plan_page
 from scenarios.show.run_page import runs_page
 from scenarios.spec.load import load
@@ -178,6 +178,18 @@ def test_a_narrow_table_breaks_no_short_word_and_scrolls_in_its_box(browser: Bro
     page.close()
 
 
+def test_a_narrow_table_of_figures_keeps_the_names_of_its_rows_and_tiles_wrap(browser: Browser) -> None:
+    rows = (("predictions", *["0.123 to 0.456"] * 6),)
+    table = Table(head=("", *("hottest", "coolest") * 3), rows=rows)
+    page = browser.new_page(viewport={"width": 390, "height": 850})
+    head = Head(tiles=(("hottest motor", f"70 °C {'x' * 54}", ""),))
+    page.set_content(Report(title="a", sections=[Section(tables=(table,))], head=head).html())
+    page.wait_for_selector(".figures dd")
+    assert page.get_by_role("cell", name="predictions").evaluate(HEIGHT_OF_TEXT) < 30  # one line
+    assert page.locator("html").evaluate("e => e.scrollWidth - e.clientWidth") <= 0
+    page.close()
+
+
 def luminance(rgb: np.ndarray) -> np.ndarray:
     """Relative luminance of colours uint8 [..., 3] (WCAG 2)."""
     linear = np.where(rgb / 255 <= 0.04045, rgb / 255 / 12.92, ((rgb / 255 + 0.055) / 1.055) ** 2.4)
@@ -205,13 +217,16 @@ def test_a_moved_and_turned_arm_reaches_what_the_lines_to_paste_say(browser: Bro
     first, *_ = load("quickstart").arms
     scenario = replace(load("quickstart"), arms=(replace(first, tilt_deg=(90.0, 10.0, 170.0)),))
     empty = {"exclusions": (), "at_once": (), "problems": ()}
-    report = LayoutReport(scenario="a", clearance_m=0.0, reach=(), excluded_share=0.0, largest=True, **empty)
+    near = Reach(arm=first.name, place="belt", payload_kg=None, lacks_m=0.0)  # within reach, but not with this tool
+    report = LayoutReport(scenario="a", clearance_m=0.0, reach=(near,), excluded_share=0.0, largest=True, **empty)
     (tmp_path / "cell.html").write_text(plan_page(scenario, report), encoding="utf-8")
     page, failed = browser.new_page(), []
     page.on("pageerror", lambda error: failed.append(str(error)))
     page.goto((tmp_path / "cell.html").as_uri())
     page.wait_for_selector("body[data-ready]")
     assert page.locator("#changes").input_value() == ""
+    assert page.locator('[data-place="belt"] text').text_content() == "belt: no arm can work here"
+    assert page.locator(".arm.unable .name").text_content() == "arm_0: can do no job"
     for handle, x, y in ((".arm rect", 90, -40), (".arm .tip", -80, 60)):
         box = page.locator(handle).bounding_box()
         page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
@@ -226,6 +241,7 @@ def test_a_moved_and_turned_arm_reaches_what_the_lines_to_paste_say(browser: Bro
     lacks_m = {p.name: np.linalg.norm(np.subtract(p.position_m, shoulder)) - REACH_M for p in scenario.places}
     expected = {name for name, far in lacks_m.items() if far > 0}
     assert 0 < len(expected) < len(lacks_m)
+    assert page.locator(".arm.unable").count() == 0
     told = {each.get_attribute("data-place"): each.text_content() for each in page.locator(".place.lacks").all()}
     assert set(told) == expected
     for name, text in told.items():

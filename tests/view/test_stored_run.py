@@ -117,13 +117,16 @@ def test_a_damaged_run_is_refused_in_words(run_folder: Path, tmp_path: Path, dam
 def test_a_page_is_no_table_and_a_comparison_no_run(run_folder: Path, tmp_path: Path, capsys) -> None:
     (tmp_path / "study").mkdir()
     (tmp_path / "study" / "study.json").write_text("{}", encoding="utf-8")
+    (tmp_path / "fleet" / "recording").mkdir(parents=True)
+    (tmp_path / "fleet" / "fleet.json").write_text("{}", encoding="utf-8")
     wrong = [
         (["report", str(run_folder), "--out", str(tmp_path / name)], "--out must end in .html (got")
         for name in ("r.csv", "r.xlsx", "r")
     ]
-    wrong.append(
-        (["report", str(tmp_path / "study")], "is of `thermofleet compare`: open its index.html in a browser.")
-    )
+    wrong += [
+        (["report", str(tmp_path / "fleet")], "is of `thermofleet live`: give"),
+        (["report", str(tmp_path / "study")], "is of `thermofleet compare`: open its index.html in a browser."),
+    ]
     for arguments, told in wrong:
         with pytest.raises(SystemExit) as ended:
             main(arguments)

@@ -133,7 +133,9 @@ function startPage() {
       if (what) note(`event/${name}/${event.number}`, event.time_s, what, ["fault", "contact", "warning"].includes(event.kind) ? event.kind : "");
     },
     result(name, result) {
-      const what = resultText(result);
+      const what = resultText(result), before = fleet.jobs.get(result.status.job);
+      if (before) fleet.counts[before.state] -= 1; // the counts of the last poll follow the table until the next one
+      fleet.counts[result.status.state] = (fleet.counts[result.status.state] || 0) + 1;
       setJob(result.status, result);
       if (what) note(`result/${name}/${result.number}/${result.time_s}`, result.time_s, what);
     },
@@ -365,7 +367,7 @@ function startPage() {
     const listed = [...fleet.jobs.values()], rank = { unfinished: 0, finishing: 1, awarded: 2, waiting: 3 };
     const open = listed.filter(({ state }) => state in rank).sort((a, b) => rank[a.state] - rank[b.state]);
     jobs.update(open.slice(0, MOST_ROWS).map((status) => [status.job, status]), fillJob);
-    const counts = Object.entries(fleet.counts), openCount = counts.reduce((sum, [state, count]) => sum + (state in rank ? count : 0), 0);
+    const counts = Object.entries(fleet.counts).filter(([, count]) => count > 0), openCount = counts.reduce((sum, [state, count]) => sum + (state in rank ? count : 0), 0);
     const counted = counts.map(([state, count]) => `${count} ${state.replace("_", " ")}`).join(", ");
     setText(element("counts"), `${counted || "No jobs"}.${openCount > MOST_ROWS ? ` The first ${MOST_ROWS} of ${openCount} open jobs are listed.` : ""}`);
     if (element("settled-part").open) settled.update(listed.filter(({ state }) => !(state in rank)).reverse().slice(0, MOST_ROWS).map((status) => [status.job, status]), fillSettled);

@@ -77,7 +77,11 @@ function startLayout() {
     });
   }
 
+  const isMoved = (arm) => far(arm.base, arm.first) > 0;
+
+  // Until an arm is moved, the remarks of the command hold; they cover more than reach.
   function update() {
+    const checked = !cell.arms.some((arm) => isMoved(arm) || arm.turn);
     for (const arm of cell.arms) {
       const [x, y] = arm.base, [a, b] = shoulder(arm), [c, d] = turned(arm, arm.ahead), set = (mark, values) =>
         Object.entries(values).forEach(([name, value]) => mark.setAttribute(name, value));
@@ -86,17 +90,20 @@ function startLayout() {
       set(arm.arrow, { x1: x, y1: -y, x2: x + c, y2: -y - d });
       set(arm.body, { x: x - text, y: -y - text });
       set(arm.tip, { cx: x + c, cy: -y - d });
-      set(arm.label, { x: x + text * 1.3, y: -y + text * 2.1 });
+      set(arm.label, { x, y: -y + text * 2.1 });
+      arm.mark.classList.toggle("unable", checked && arm.remark !== "");
+      arm.label.textContent = checked && arm.remark ? `${arm.name}: ${arm.remark}` : arm.name;
     }
     for (const place of cell.places) {
       const farther = cell.arms.map((arm) => far(shoulder(arm), place.at) - cell.reach_m), lacks = Math.min(...farther);
       const near = cell.arms.filter((arm, i) => farther[i] <= 0).map((arm) => arm.name);
-      place.who.textContent = `in reach of ${near.join(", ") || "no arm"}`;
-      place.mark.classList.toggle("lacks", lacks > 0);
-      place.label.textContent = place.name + (lacks > 0 ? ` lacks ${Math.max(lacks, 0.01).toFixed(2)} m` : "");
+      const remark = checked ? place.remark : lacks > 0 ? `lacks ${Math.max(lacks, 0.01).toFixed(2)} m` : "";
+      place.who.textContent = checked ? `${place.able.join(", ") || "no arm"} can work here` : `in reach of ${near.join(", ") || "no arm"}`;
+      place.mark.classList.toggle("lacks", remark !== "");
+      place.label.textContent = remark ? `${place.name}: ${remark}` : place.name;
     }
     changes.value = cell.arms.flatMap((arm) => {
-      const moved = far(arm.base, arm.first) > 0, tilt = [arm.tilt[0], arm.tilt[1], round(arm.tilt[2] + arm.turn, 6)];
+      const moved = isMoved(arm), tilt = [arm.tilt[0], arm.tilt[1], round(arm.tilt[2] + arm.turn, 6)];
       if (tilt[2] > 180) tilt[2] = round(tilt[2] - 360, 6);
       if (tilt[2] <= -180) tilt[2] = round(tilt[2] + 360, 6);
       return [

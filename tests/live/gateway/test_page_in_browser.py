@@ -241,6 +241,17 @@ def test_a_press_ends_on_the_button_on_which_it_began(served, fleet, open_page):
     expect(page.locator("#jobs tbody tr")).to_have_count(7)
 
 
+def test_the_counts_follow_the_table_between_two_polls(served, fleet, open_page):
+    fleet.post(lambda: fleet.set("crate", state="waiting"))
+    page = open_page(served, errors=True)
+    expect(page.locator("#counts")).to_have_text("1 waiting.")
+    page.route("**/v4/fleet*", lambda route: route.abort())
+    for name, state in (("crate", "finished"), ("lost", "unfinished")):
+        fleet.post(lambda name=name, state=state: fleet.set(name, state=state))
+    expect(page.locator("#jobs tbody tr")).to_contain_text("lost")
+    expect(page.locator("#counts")).to_have_text("1 finished, 1 unfinished.", timeout=5000)
+
+
 @pytest.mark.ci_slow
 def test_the_keyboard_is_enough(served, fleet, open_page):
     page = open_page(served)
