@@ -238,12 +238,13 @@ class Shift(Fleet):
                 raise Violation(f"No end after {self.world.now_s:.0f} s: {'; '.join(self._open()[:4])}.")
             if self._is_paused():
                 request(self, Resume())
-            self.world.run(self.world.now_s + CHECK_S / 4)
-            if not (self._is_idle() and (jobs := self._ready())):
-                idle_s = self.world.now_s
-            elif self.world.now_s > (since_s := max(idle_s, self.departed_s)) + IDLE_S:
-                idle_for_s = self.world.now_s - since_s
-                raise Violation(f"'{jobs[0]}' could begin, and all arms are idle for {idle_for_s:.1f} s.")
+            for _ in range(4):
+                self.world.run(self.world.now_s + CHECK_S / 4)
+                if not (self._is_idle() and (jobs := self._ready())):
+                    idle_s = self.world.now_s
+                elif self.world.now_s > (since_s := max(idle_s, self.departed_s)) + IDLE_S:
+                    idle_for_s = self.world.now_s - since_s
+                    raise Violation(f"'{jobs[0]}' could begin, and all arms are idle for {idle_for_s:.1f} s.")
         self.unsure |= {job for builder in self.builders.values() for job in builder.unsure}
         states = self.statuses()
         results = [each.status for each in self.sent.messages.values() if isinstance(each, Result)]
