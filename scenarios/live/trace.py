@@ -181,7 +181,7 @@ def thread_table(thread: Thread) -> Table:
     others = [str(each) for each in thread.alike if each != thread.row]
     alike = f"the first of {len(thread.alike)}, others in rows {', '.join(others[:5])}" if others else ""
     row("event", f"row {thread.row} of {thread.folder}", alike, "…" if len(others) > 5 else "")
-    row("", *_words(event), MEANINGS[event.kind].text)
+    row("", *_words(event), MEANINGS[event.kind].text.replace("`joint`", f"joint {event.joint}").replace("`", ""))
     if thread.job:
         row("job", *_pairs({name.removesuffix("_s"): _moment(name, value) for name, value in thread.job.items()}))
     if thread.award is not None:
@@ -214,7 +214,8 @@ def thread_table(thread: Thread) -> Table:
 
 def _words(event: Event) -> list[str]:
     joint = f"joint {event.joint}" if event.joint else ""
-    value = f"{MEANINGS[event.kind].value or 'value'} {event.value:.4g}" if event.value == event.value else ""
+    what, _, unit = (MEANINGS[event.kind].value or "value").partition(", ")
+    value = f"{what} {event.value:.4g} {unit.split(';')[0]}".rstrip() if event.value == event.value else ""
     return [
         clock(event.time_s),
         event.kind.replace("_", " "),

@@ -313,9 +313,12 @@ def test_the_command_shows_one_screen_or_json(folder: Path, thermofleet, capsys,
     assert len(screen.splitlines()) < 60
     assert all(head in screen for head in ("event", "job", "award", "plan", "offers", "twin", "configuration", "code"))
     thread = thread_of(Path("runs/one"), "finish")
-    odd = replace(thread, event=replace(thread.event, reason="[bold]a[/b] of others"))
-    out_console.print(thread_table(odd))
-    assert "[bold]a[/b] of others" in capsys.readouterr().out
+    odd = replace(thread.event, kind="fault", joint=2, value=75.04, reason="[bold]a[/b] of others")
+    out_console.print(thread_table(replace(thread, event=odd)))
+    shown = " ".join(capsys.readouterr().out.split())
+    assert all(
+        each in shown for each in ("[bold]a[/b] of others", "temperature 75.04 °C", "The motor of joint 2 passed")
+    )
     shown = json.loads(text)
     assert (shown["event"]["kind"], shown["award"]["kind"]) == ("finish", "award")
     assert code_hash() in screen
