@@ -126,7 +126,7 @@ def reason_to_follow(before: str) -> str:
     return f"Given up, because it waits for '{before}', which is given up or cancelled."
 
 
-NO_STATES: Mapping[str, str] = {}
+NONE_ENDED: Mapping[str, str] = {}
 
 
 def admit(
@@ -138,7 +138,7 @@ def admit(
     limit: int = MAX_OPEN_JOBS,
     ended: bool = False,
     given_up: Container[str] = (),
-    ended_as: Mapping[str, str] = NO_STATES,
+    ended_as: Mapping[str, str] = NONE_ENDED,
     past: PastJobs | None = None,
     time_s: float = -inf,
 ) -> tuple[Admission, ...]:

@@ -346,10 +346,6 @@ class Refusals:
         while len(self._reasons) > MAX_UNKNOWN:
             del self._reasons[next(iter(self._reasons))]
 
-    def refused_by_all(self, arms: Set[str], job: str) -> bool:
-        """Return whether there are such reasons."""
-        return bool(self.of_all(job, arms))
-
     def of_all(self, job: str, arms: Set[str]) -> Mapping[str, str]:
         """Return the reasons, by arm, why none of these arms, and no other that has answered, can do a job.
 
@@ -358,6 +354,10 @@ class Refusals:
         reasons = self._reasons.get(job, {})
         known = bool(reasons) and not (arms - reasons.keys() or NOT_PLANNED in reasons.values())
         return reasons if known and all(reasons.values()) else {}
+
+    def refused_by_all(self, arms: Set[str], job: str) -> bool:
+        """Return whether there are reasons as of `of_all`."""
+        return bool(self.of_all(job, arms))
 
 
 class BackOff(NamedTuple):

@@ -318,7 +318,7 @@ class Participant:
         idle = book.ended or book.is_paused(self.name) or self._arm.unfit()
         capacity = 0 if idle else max(0, self.claimant.capacity)
         later = {job for job, until_s in self._later_s.items() if until_s > real_s}
-        # Last come those that it cannot do, and no other is known to be able to: whoever is bids for them.
+        # A job that this arm cannot do, and that no bid can do, comes last: a peer that is able to do it bids for it.
         rank = partial(self._refusals.refused_by_all, {self.name})
         ready = book.ready(time_s, self._slots, excluded=later, rank=rank)
         names = [job.name for job in ready]

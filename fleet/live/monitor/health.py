@@ -17,6 +17,7 @@ from fleet.bus.security.tls import UNKNOWN_CERTIFICATE
 from fleet.live.clock import FleetClock
 from fleet.live.job_rules import NO_CYCLE
 from fleet.live.monitor.snapshot import FRESH_S, SILENT_S, ArmSnapshot, FleetSnapshot
+from fleet.readings import TEMP_RANGE_C
 
 REASONS = {
     "It is released at": "release", "It waits for": "predecessor", "are paused": "paused",
@@ -37,8 +38,8 @@ EXPECTED = ("release", "predecessor", "paused", "queue", "break", "planning", "h
 MOST_REASONS = 5
 NO_OFFSETS: Mapping[str, float] = {}
 NO_COMPLAINTS: Mapping[str, str] = {}
-MOST_LIMIT_C = 200.0
-"""°C: no motor has a higher warning limit."""
+MOST_LIMIT_C = TEMP_RANGE_C[1]
+"""No motor has a higher warning limit."""
 OFFSET_S, SLOW_S = 1.0, 0.1
 """Real seconds: clock offsets and round trips above these are findings."""
 
