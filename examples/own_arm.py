@@ -88,6 +88,7 @@ class Arm:
             self.report("returned")
         lapsed_s = max(self.quotes.values(), default=0.0) + VALID_S  # later quotes are without capacity
         self.serve(LEAVE_S, lambda: not (self.reports or self.closed) and time.monotonic() > lapsed_s)
+        self.publish_state()
 
     def serve(self, seconds, is_done):
         """Reply, work and publish for this time, or until it is done."""
@@ -289,6 +290,7 @@ class Arm:
             "temp_c": [self.temp_c],
             "headroom_k": LIMIT_C - self.temp_c,
             "job": self.job["job"] if self.job else "",
+            "leaving": self.leaving,
         }
         self.session.put(
             f"{self.own_key}/state",

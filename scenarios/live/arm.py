@@ -114,6 +114,7 @@ def run_arm(
         return_memory()
         echo(f"ready {name} {endpoint} {os.getpid()}")
         if alone and serve_until_done(node, stop):
+            node.retire(time.monotonic())
             return
         while not stop.is_set():
             node.serve(time.monotonic() + TURN_S)

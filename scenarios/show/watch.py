@@ -398,7 +398,7 @@ def _mark(headroom_k: float | None) -> str:
 
 
 def _name_and_mode(arm: ArmSnapshot) -> tuple[str, Text]:
-    mode = (arm.mode or "—") if arm.token else "gone"
+    mode = (arm.mode or "—") if arm.token else "left" if arm.left else "gone"
     return arm.arm, Text(mode, style=_MODE_STYLES.get(mode, ""))
 
 

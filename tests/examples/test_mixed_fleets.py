@@ -48,6 +48,8 @@ def test_own_arm_and_the_submitter_work_with_the_real_auctioneer(bus, tmp_path):
     watcher.subscribe(
         keys.of_every_auction("f", "result"), Result, lambda _, result: statuses.append(result.status), history=True
     )
+    last = {}
+    watcher.subscribe(keys.of_every_arm("f", "state"), State, lambda _, state: last.update({state.arm: state}))
     at = ("--fleet", "f", "--endpoint", f"tcp/127.0.0.1:{port}")
     started_auction = commands.start(
         "bus", "auctioneer", "quickstart", "--jobs", "none", *at, "--journal", tmp_path / "j"
@@ -70,6 +72,7 @@ def test_own_arm_and_the_submitter_work_with_the_real_auctioneer(bus, tmp_path):
             for arm, number in zip(arms, (signal.SIGTERM, signal.SIGINT), strict=True):
                 arm.send_signal(number)
                 assert arm.wait(PATIENCE_S) == 130
+            serve_until(lambda: all(last[arm].leaving and not last[arm].job for arm in ("a", "b")), watcher)
             asked = keys.of_jobs("f", "status"), StatusRequest(), Status
             for _ in range(40):  # the auctioneer may still handle the last quotes and leases
                 (reply,) = watcher.query_and_wait(*asked, timeout_s=PATIENCE_S).messages.values()

@@ -258,11 +258,14 @@ def test_an_arm_takes_no_jobs_in_a_break_and_returns_or_finishes_its_own_first(b
 
 
 def test_a_stopped_arm_returns_its_job_as_sure(bus):
-    auctioneer, line = Auctioneer(bus.link()), bus.link()
+    auctioneer, line, states = Auctioneer(bus.link()), bus.link(), []
+    line.subscribe(keys.of_every_arm("f", "state"), State, lambda _, state: states.append(state))
     arm = bus.arm(speed=1.0)
     assign(bus, line)
+    bus.serve(lambda: states)
+    assert not states[-1].leaving
     arm.node.retire(time.monotonic())
-    bus.serve(lambda: auctioneer.reports)
+    bus.serve(lambda: auctioneer.reports and states[-1].leaving)
     (report,) = auctioneer.reports
     assert (report.outcome, report.unsure, report.reason) == ("returned", False, "The arm was stopped.")
     bus.serve(lambda: not arm.node.executor.has_pending_reports)

@@ -19,7 +19,7 @@ from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Alarm
 from fleet.bus.router import Router
 from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_arm, check_fleet, check_health, check_progress
-from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, AuctioneerSnapshot, FleetSnapshot
+from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, AuctioneerSnapshot, FleetSnapshot, FleetView
 from scenarios.show.watch import space_line
 from tests import commands
 from tests.waiting import serving
@@ -235,6 +235,26 @@ def test_an_arm_whose_states_are_malformed_is_not_said_to_hang(age_s, says):
 def test_the_alarm_of_an_absent_arm_names_its_cause(change, why):
     (finding,) = check_arm(arm(present=False, **change), None)
     assert finding.lasting.startswith(f"a is absent: {why}")
+
+
+@pytest.mark.parametrize(
+    ("change", "left"),
+    [
+        ({}, True),
+        ({"leaving": False}, False),
+        ({"job": "j"}, False),
+        ({"space": "s"}, False),
+    ],
+)
+def test_an_arm_that_has_left_in_order_is_no_fault(change, left):
+    view = FleetView("f")
+    view.set_token("arm", "a", True)
+    last = State(arm="a", tick=0, time_s=0.0, mode="idle", temp_c=(), headroom_k=9.0, leaving=True)
+    view.update("a", msgspec.structs.replace(last, **change), 100.0)
+    assert not view.snapshot(100.0).arms[0].left  # its process runs
+    view.set_token("arm", "a", False)
+    (finding,) = check_arm(view.snapshot(110.0).arms[0], None)
+    assert (finding.level, finding.kind) == (("note", "") if left else ("fault", "absent"))
 
 
 @pytest.mark.parametrize(

@@ -103,6 +103,8 @@ class State(FiniteStruct, frozen=True, omit_defaults=True):
     """Time until the arm's next break begins, 0 during one; left out without any. In a break it takes no jobs."""
     expected_c: tuple[Celsius, ...] = ()
     """Motor temperatures that the arm's thermal network yields for the heat that it measures, [joint]."""
+    leaving: bool = False
+    """The arm ends in order and takes no more jobs. If it has neither job nor space, this may be its last state."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -444,6 +444,7 @@ class ArmNode:
         self._break: Break | None = None
         self._quoted_s = -math.inf
         self._idle: bool = False
+        self._leaving: bool = False
         self._state_due_s = self._retry_s = -math.inf
         """Real seconds at which the next state message and the next attempt to write are due."""
         self._warn = RateLimitedWarnings(self._name)
@@ -458,9 +459,9 @@ class ArmNode:
     def retire(self, until_s: float) -> None:
         """Return all awards, report them until they are acknowledged, and quote the space of an arm at home.
 
-        At the latest it ends when `time.monotonic()` is `until_s`.
+        The last state says that the arm leaves. At the latest it ends when `time.monotonic()` is `until_s`.
         """
-        self._config = replace(self._config, takes_jobs=False)
+        self._config, self._leaving = replace(self._config, takes_jobs=False), True
         self.executor.return_all(self._body.time_s, time.monotonic(), "The arm was stopped.")
         reported_s = time.monotonic() if self.executor.has_pending_reports else -math.inf
         while time.monotonic() < until_s:
@@ -469,6 +470,7 @@ class ArmNode:
             elif self._body.away is not None or self._quoted_s >= reported_s:
                 break
             self.serve(min(until_s, time.monotonic() + POLL_S))
+        self._send_state()
 
     # Requests
 
@@ -758,6 +760,7 @@ class ArmNode:
                 housing_c=tuple(self._body.housing_c.tolist()),
                 ambient_c=self._ambient_c,
                 break_in_s=break_in_s(self._config.breaks, self._body.time_s),
+                leaving=self._leaving,
                 **self._describe_job(),
                 **vars(self._reading),
             )

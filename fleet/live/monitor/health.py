@@ -369,6 +369,8 @@ def check_arm(arm: ArmSnapshot, offset_s: float | None, *, malformed: str = "") 
     age_s = arm.state_age_s
     if not arm.token and age_s is None:
         return [Finding("warning", f"{arm.arm} has left: it has no token, but some of its messages are still cached.")]
+    if arm.left:
+        return [Finding("note", f"{arm.arm} has left in order.")]
     problem, cause = "", "its process may hang."
     why = "it has left, or its process hangs or has ended."
     if malformed:

@@ -123,6 +123,8 @@ class ArmSnapshot(msgspec.Struct, frozen=True):
     """Fleet seconds until it is home with its current job done."""
     away: bool = False
     """It reports that it is away from home."""
+    left: bool = False
+    """It has ended in order: it shows no token, and its last state says so, without job and space."""
     doubled: bool = False
     """The ticks of its states do not count up: two processes publish them, or the arm does not count."""
     scores: dict[str, JobScore] = {}
@@ -626,6 +628,7 @@ def _arm_snapshot(name: str, arm: _Arm, now_s: float, speed: float | None, ended
         job=state.job if state else "",
         busy_s=state.busy_s if state else 0.0,
         away=bool(state and state.space),
+        left=bool(not arm.token and state and state.leaving and not state.job and not state.space),
         doubled=arm.is_doubled(now_s),
         scores={job: score for job, score in by_job if job not in ended},
         joints=info.joints if info else None,

@@ -202,7 +202,7 @@ function startPage() {
     const total = (field) => snapshot.arms.reduce((sum, one) => sum + one[field], 0), workedS = total("worked_s"), heated = total("heat_n2m2s");
     for (const one of snapshot.arms) {
       const arm = armOf(one.arm);
-      Object.assign(arm, { token: one.token, badSensor: one.bad_sensor, possibleC: one.temp_c, idle: one.idle });
+      Object.assign(arm, { token: one.token, left: one.left, badSensor: one.bad_sensor, possibleC: one.temp_c, idle: one.idle });
       arm.shares = [[one.worked_s, workedS], [one.heat_n2m2s, heated]].map(([part, all]) => all ? `${Math.round(100 * part / all)} %` : "—").join(", ");
       if (one.state_age_s !== null) arm.atMs = Math.max(arm.atMs, nowMs - 1000 * one.state_age_s);
       arm.difficultyMs = one.difficulty_age_s === null ? null : nowMs - 1000 * one.difficulty_age_s;
@@ -256,7 +256,7 @@ function startPage() {
       hot.append(make("span", { class: "bar", "aria-hidden": "true" }, make("i")), make("span"));
     }
     const pause = ["*", arm.name].find((one) => Object.hasOwn(fleet.paused, one)) || "";
-    const word = here ? MODES[state.mode] : "◌ absent";
+    const word = here ? MODES[state.mode] : arm.left ? "◌ left" : "◌ absent";
     setText(mode, pause ? `${word}, ❚❚ paused` : word);
     setClass(row, here ? state.mode : "absent");
     const temps = state ? temperatures(arm) : [], tempC = Math.max(...temps), of = state && fleet.jobs.get(state.job);
