@@ -21,6 +21,13 @@ PICTURES = ROOT / "docs" / "pictures"
 FILM_RUN = ("quickstart", "--policy", "round_robin", "--difficulty", "oracle", "--seed", "5")
 FILM = ("--size", "640x360", "--speed", "240", "--fps", "8", "--overwrite")
 REPORT_RUN = ("active_waiting", "--policy", "round_robin", "--difficulty", "oracle", "--seed", "1")
+OFFERS_RUN, OFFERS = ("quickstart", "--policy", "wsept", "--seed", "5"), "Why each arm got its job"
+"""With the twins of the package, and the heading of the table of offers in its report."""
+COMPARISON = (
+    *("quickstart", "--difficulty", "oracle", "--policies", "round_robin,wspt,wsept"),
+    *("--baseline", "round_robin", "--seeds", "10"),
+)
+"""As in the tutorial."""
 CELLS = (
     *("quickstart", "active_waiting", "heat_wave", "people_near"),
     *("machine_tending", "assembly", "palletising_line"),
@@ -38,8 +45,8 @@ def thermofleet(*words: str) -> None:
     subprocess.run([sys.executable, "-m", "scenarios", *words], check=True, cwd=ROOT)
 
 
-def screenshot(page: Path, picture: Path) -> None:
-    """A picture of the first screen of a report."""
+def screenshot(page: Path, picture: Path, *, heading: str = "", height: int = 1500) -> None:
+    """A picture of a page: its first screen, or from a heading on, with what is folded below it."""
     chromium = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
     if chromium is None:
         sys.exit(
@@ -47,9 +54,13 @@ def screenshot(page: Path, picture: Path) -> None:
         )
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium, args=list(GRAPHICS))
-        view = browser.new_page(viewport={"width": 1280, "height": 1500})
+        view = browser.new_page(viewport={"width": 1280, "height": height})
         view.goto(page.as_uri())
         view.wait_for_selector("body[data-ready]")
+        if heading:
+            found = view.get_by_role("heading", name=heading)
+            found.evaluate("it => { for (const one of it.parentElement.querySelectorAll('details')) one.open = true; }")
+            found.evaluate("it => it.scrollIntoView()")
         view.screenshot(path=picture)
         browser.close()
 
@@ -110,6 +121,12 @@ def main() -> None:
         thermofleet("view", film, "--out", str(PICTURES / "shift.gif"), *FILM)
         thermofleet("run", *REPORT_RUN, "--out", report)
         screenshot(Path(report) / "report.html", PICTURES / "report.png")
+        offers = str(Path(folder) / "offers")
+        thermofleet("run", *OFFERS_RUN, "--out", offers)
+        screenshot(Path(offers) / "report.html", PICTURES / "offers.png", heading=OFFERS, height=420)
+        comparison = str(Path(folder) / "comparison")
+        thermofleet("compare", *COMPARISON, "--out", comparison)
+        screenshot(Path(comparison) / "index.html", PICTURES / "comparison.png", height=1000)
     for scenario in CELLS:
         thermofleet("layout", scenario, "--out", str(PICTURES / "library" / f"{scenario}.png"), "--overwrite")
     trainings = sorted((ROOT / "docs" / "results" / "learned").glob("train-pairs-*"))
