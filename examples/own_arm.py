@@ -20,6 +20,7 @@ from zenoh import ext
 
 STATE_S, CYCLE_S, VALID_S, RENEW_S, LEAVE_S = 0.1, 0.1, 3.0, 0.5, 5.0
 LIMIT_C, AMBIENT_C = 60.0, 25.0
+SPACE = "sphere:10,0,0,1"  # all that the arm can touch: X, Y, Z and radius in the frame of the scenario, m
 DRIFT = 0.01  # largest relative difference between two clocks: our measure of a lease must end first
 
 
@@ -153,6 +154,7 @@ class Arm:
             "mode": "working" if self.job else "idle",
             "headroom_k": LIMIT_C - self.temp_c,
             "capacity": 0 if self.job or self.leaving else 1,
+            "space": [SPACE] if self.job or self.reports else [],
             "estimates": estimates,
         }
 
@@ -166,6 +168,7 @@ class Arm:
             "gained_k": 0.1 * cycles,
             "joint_difficulty": [d],
             "difficulty": d,
+            "space": SPACE,
             "duration_s": self.speed * CYCLE_S * cycles,  # in fleet time
             "finish_in_s": self.speed * CYCLE_S * cycles,
         }

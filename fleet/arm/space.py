@@ -75,12 +75,6 @@ def space_name(key: PlanKey) -> str:
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
-def arms_in_reach(robots: Sequence[Robot], margin_m: float) -> frozenset[frozenset[str]]:
-    """Pairs of arms, by name, that could come closer to each other than a margin in some posture."""
-    pairs = combinations(robots, 2)
-    return frozenset(frozenset((one.name, other.name)) for one, other in pairs if _in_reach(one, other, margin_m))
-
-
 def space_table(
     robots: Sequence[Robot],
     plans: Sequence[Plan],

@@ -2,11 +2,15 @@
 
 An arm takes the space of a plan from its grant until the arm reports that it is at home again: no lease and no timeout
 frees it. On the bus the space of a plan has a name that every participant
-computes from the plan (`fleet.arm.space.space_name`). An unknown name stands for the whole workspace of the arm.
+computes from the plan (`fleet.arm.space.space_name`). `sphere:X,Y,Z,R` is a sphere in the frame of the cell, m: for
+an arm that the scenario does not know. Any other name stands for the whole workspace of the arm.
 """
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +19,35 @@ ANYWHERE = "*"
 Excludes = Callable[[str, str, str, str], bool]
 """Whether the spaces of two arms exclude each other; arguments: arm, name of its space, other arm, name of its space.
 Symmetric."""
+
+
+MOST_M = 1000.0
+"""Largest coordinate and radius of a sphere."""
+
+
+class Sphere(NamedTuple):
+    """A sphere in the frame of the cell, m."""
+
+    x: float
+    y: float
+    z: float
+    radius: float
+
+    def gap_m(self, other: "Sphere") -> float:
+        """Distance to another sphere, negative if they overlap."""
+        return math.dist(self[:3], other[:3]) - self.radius - other.radius
+
+
+@lru_cache(maxsize=4096)
+def sphere_of(space: str) -> Sphere | None:
+    """The sphere that a space names, as `sphere:1.5,0,0.4,0.8`; None if it names none."""
+    kind, _, numbers = space.partition(":")
+    try:
+        values = [float(number) for number in numbers.split(",")]
+    except ValueError:
+        return None
+    fits = kind == "sphere" and len(values) == len(Sphere._fields) and all(abs(value) <= MOST_M for value in values)
+    return Sphere(*values) if fits and values[-1] > 0 else None
 
 
 def no_conflicts(arm: str, space: str, other: str, other_space: str) -> bool:
@@ -30,17 +63,22 @@ class CellSpace:
     """Row of `conflicts` by name of the space."""
     conflicts: np.ndarray
     """bool [volume, volume], symmetric."""
-    reach: frozenset[frozenset[str]]
-    """All pairs of arms within reach of each other."""
-    arms: frozenset[str]
-    """Arms of the cell; the position of any other arm is unknown."""
+    workspaces: Mapping[str, Sphere]
+    """All that an arm of the cell can reach, by arm; the position of any other arm is unknown."""
+    clearance_m: float
+    """Spheres that come closer than this exclude each other."""
 
     def __call__(self, arm: str, space: str, other: str, other_space: str) -> bool:
-        """Return whether two spaces exclude each other; unknown ones do if their arms can touch."""
+        """Return whether two spaces exclude each other.
+
+        Spheres stand for whatever is not a plan of the cell. An arm at an unknown position excludes all.
+        """
         rows = self.volume.get(space), self.volume.get(other_space)
         if None not in rows:
             return bool(self.conflicts[rows])
-        return frozenset((arm, other)) in self.reach or not {arm, other} <= self.arms
+        one = sphere_of(space) or self.workspaces.get(arm)
+        two = sphere_of(other_space) or self.workspaces.get(other)
+        return one is None or two is None or one.gap_m(two) < self.clearance_m
 
 
 def arms_in_the_way(

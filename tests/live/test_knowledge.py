@@ -29,7 +29,7 @@ from fleet.live.consensus.grants import Granter
 from fleet.live.consensus.participant import QUIET_S, Membership, Participant
 from fleet.live.leases import Timing
 from fleet.live.records import SendAward
-from fleet.live.space import CellSpace
+from fleet.live.space import CellSpace, Sphere
 from fleet.observation import FIELDS, Observation
 from fleet.robot import JOINTS, ThermalLimits
 from scenarios.live.auctioneer import CentralAllocation, job_spec
@@ -98,9 +98,9 @@ class LiveShift:
         self.time_s = self.real_s = 0.0
         world, (plans, table) = env.world, conflicts
         volume = {space_name(plan_key(plan)): row for row, plan in enumerate(plans)}
-        reach = frozenset(frozenset((a, b)) for a in NAMES for b in NAMES if a != b)
+        workspaces = dict.fromkeys(NAMES, Sphere(0.0, 0.0, 0.0, 1.5))
         self.jobs, self.fleet = tuple(map(job_spec, jobs)), fleet
-        self.excludes = CellSpace(volume=volume, conflicts=table, reach=reach, arms=frozenset(NAMES))
+        self.excludes = CellSpace(volume=volume, conflicts=table, workspaces=workspaces, clearance_m=0.02)
         timing = Timing(lease_s=HOUR_S, pause_s=(0.1, 0.2))
         rules = {"allocate": allocate, "timing": timing, "excludes": self.excludes}
         ledger = JobBook(arms=NAMES)

@@ -7,14 +7,14 @@ import pytest
 
 from fleet.arm.space import space_name
 from fleet.job import Place, Work
-from fleet.live.space import ANYWHERE, CellSpace, arms_in_the_way
+from fleet.live.space import ANYWHERE, CellSpace, Sphere, arms_in_the_way
 
 WORK = Work(kind="hold", places=(Place(name="bench", position_m=(0.5, 0.0, 0.2)),), payload_kg=2.0)
 CELL = CellSpace(
     volume={"a": 0, "b": 1, "c": 2},
     conflicts=np.array([[1, 1, 0], [1, 1, 0], [0, 0, 1]], bool),
-    reach=frozenset([frozenset(["one", "other"])]),
-    arms=frozenset(["one", "other", "far"]),
+    workspaces={"one": Sphere(0, 0, 0, 1.5), "other": Sphere(2.9, 0, 0, 1.5), "far": Sphere(9, 0, 0, 1.5)},
+    clearance_m=0.02,
 )
 
 
@@ -40,6 +40,19 @@ def test_the_name_of_a_space_follows_from_the_values_of_the_plan():
         ("one", "a", "far", "unknown", False),
         ("one", "a", "outsider", "unknown", True),
         ("far", ANYWHERE, "one", ANYWHERE, False),
+        ("one", "a", "outsider", "sphere:-2.5,0,0,0.9", False),
+        ("one", ANYWHERE, "outsider", "sphere:-2.5,0,0,0.9", False),
+        ("one", "a", "outsider", "sphere:-2.5,0,0,0.99", True),  # nearer than the clearance
+        ("outsider", "sphere:0,-5,0,1", "another", "sphere:0,-7.03,0,1", False),
+        ("outsider", "sphere:0,-5,0,1", "another", "sphere:0,-7.01,0,1", True),
+        ("outsider", "sphere:50,0,0,1", "another", ANYWHERE, True),
+        ("one", "a", "outsider", "sphere:50,0,0,0", True),
+        ("one", "a", "outsider", "sphere:50,0,0,-1", True),
+        ("one", "a", "outsider", "sphere:50,0,1", True),
+        ("one", "a", "outsider", "sphere:50,0,0,nan", True),
+        ("one", "a", "outsider", "sphere:1e4,0,0,1", True),
+        ("one", "a", "outsider", "ball:50,0,0,1", True),
+        ("one", "sphere:0,0,0,0.1", "other", "sphere:2.9,0,0,0.1", False),  # it knows better
     ],
 )
 def test_spaces_of_a_cell_exclude_each_other_both_ways(arm, space, other, other_space, excluded):

@@ -172,7 +172,8 @@ class PlanQuote(FiniteStruct, frozen=True, omit_defaults=True):
     finish_in_s: Duration | None = None
     """Time until its last cycle would be done, after the arm's current jobs; without the way home."""
     space: Name | None = None
-    """Name of the space of its plan, from home to home; null for unknown: its whole workspace counts as taken."""
+    """Name of the space of its plan, from home to home, or a sphere that it does not leave, in the frame of the cell, as
+    `sphere:1.5,0,0.4,0.8` (X, Y, Z, radius, m); null for unknown: its whole workspace counts as taken."""
 
 
 class JobEstimate(msgspec.Struct, frozen=True, omit_defaults=True):
