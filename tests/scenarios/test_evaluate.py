@@ -251,7 +251,7 @@ def test_where_heat_binds_has_a_mean_of_its_own():
     assert found.cool is not None
     assert (found.hot.mean, found.cool.mean) == pytest.approx((0.4, 0.9))
     assert values.reachable == "0.80 (1.00 where heat binds, 0.40 where it does not)"
-    assert f"Mean of the hindsight: {values.reachable}." in scores_of(values, "a").remarks[0]
+    assert f"Mean score of the hindsight: {values.reachable}." in scores_of(values, "a").remarks[0]
     other = replace(values, instances=("quickstart/1", *values.instances[1:]))
     assert scores_of(other, "a").policies["a"].hot is None
 
