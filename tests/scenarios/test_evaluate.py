@@ -257,7 +257,7 @@ def test_where_heat_binds_has_a_mean_of_its_own():
 
 
 def test_trainings_of_a_policy_are_a_sample_and_those_of_twins_are_not():
-    rewards = {0: 15.0, 1: 40.0, 2: 5.0}
+    rewards: dict[int, float | None] = {0: 15.0, 1: 40.0, 2: 5.0}
     by_policy = {"pairs-*": rows_of("pairs-*", rewards, 3), "a": rows_of("a", {0: 12.0, 1: 30.0, 2: 5.0})}
     values = scored(by_policy, REFERENCES)
     assert values is not None
