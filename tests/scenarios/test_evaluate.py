@@ -319,7 +319,7 @@ def test_of_several_references_of_a_shift_that_with_the_compared_predictions_cou
 
 def test_a_policy_that_declares_to_read_no_messages_cannot_read_them(scenario, plans, tmp_path):
     """Otherwise it would see all of them on a channel that loses most."""
-    body = "    def reset(self, rng): pass\n    def choose(self, seen, place): return int(seen.{} is None)\n"
+    body = "    def reset(self, rng): pass\n    def choose(self, seen, arm_index): return int(seen.{} is None)\n"
     for name, field in (("fleet", "fleet_busy_s"), ("peer", "peer_working"), ("own", "busy_s")):
         text = f"class Deaf:\n    scope, reads_messages = 'arm', False\n{body.format(field)}"
         (tmp_path / f"{name}.py").write_text(text, encoding="utf-8")
