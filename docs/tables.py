@@ -563,7 +563,12 @@ def workers_table(path: Path) -> str:
 def commands_table(folder: Path) -> str:
     measured = json.loads((folder / "commands.json").read_text(encoding="utf-8"))
     rows = [
-        (f"`{each['command']}`", f"{each['cpu_s']:.0f}", f"{each['wall_s']:.0f}", f"{each['most_mb'] / 1000:.2f}")
+        (
+            re.sub("^[^,]+", r"`\g<0>`", each["command"]),  # as `show`, plans included
+            f"{each['cpu_s']:.0f}",
+            f"{each['wall_s']:.0f}",
+            f"{each['most_mb'] / 1000:.2f}",
+        )
         for each in measured["commands"]
     ]
     return table(("command", "CPU s", "s", "memory, GB"), rows)
