@@ -184,15 +184,15 @@ class Consensus(LeastDifficulty):
 
     def actions(self, seen: Observation) -> Array:
         """Each arm's claim after the last round."""
-        place = np.arange(seen.action_mask.shape[1])
+        arm_index = np.arange(seen.action_mask.shape[1])
         online = (seen.peer_heard > 0) & (seen.peer_age_s <= 0)
-        claims = agree(_bids(seen, place), in_fleet(online, place, False)).claims
+        claims = agree(_bids(seen, arm_index), in_fleet(online, arm_index, False)).claims
         claimed = least_difficult(seen, np.maximum(claims, 0))
         return np.where(claims == NOBODY, WAIT, claimed + 1)
 
 
-def _bids(seen: Observation, place: Array) -> Array:
+def _bids(seen: Observation, arm_index: Array) -> Array:
     """Cost of each slot to each arm, [env, arm, slot]; inf for those that it may not claim."""
     legal = np.any(legal_options(seen).reshape(*seen.offered.shape, -1), axis=-1)
-    relative = advantage(seen, place, np.asarray(legal))[:, place, place]
+    relative = advantage(seen, arm_index, np.asarray(legal))[:, arm_index, arm_index]
     return np.where(legal, np.where(np.isnan(relative), _UNKNOWN, relative), np.inf).round(9)

@@ -175,10 +175,10 @@ class GuardedArm:
         self._guards = {}
         self._policy.reset(rng)
 
-    def choose(self, observation: Observation, place: int) -> int:
+    def choose(self, observation: Observation, arm_index: int) -> int:
         """The choice of the policy among the claims that the guard allows."""
         guard = self._guards.setdefault("", _GuardOfArm(self._make_guard()))
-        return guard.decide(observation, self._policy.choose(guard.narrow(observation), place))
+        return guard.decide(observation, self._policy.choose(guard.narrow(observation), arm_index))
 
 
 class GuardedFleet(GuardedArm):

@@ -93,11 +93,11 @@ def no_simulator(name: str) -> FleetError:
 class ArmPolicy(_Resettable, Protocol):
     """Chooses one option (or WAIT) for one arm; every arm has an instance of its own."""
 
-    def choose(self, observation: Observation, place: int) -> int:
+    def choose(self, observation: Observation, arm_index: int) -> int:
         """WAIT, k to claim option k - 1, or the last action to give the job back.
 
         Args:
-            place: The arm's index in the fleet, for example to break ties.
+            arm_index: The arm's index in the fleet, for example to break ties.
         """
         ...
 
@@ -180,7 +180,7 @@ class Local(ArrayPolicy):
         """Begin a shift."""
         self._policy.reset(rng)
 
-    def choose(self, observation: Observation, place: int) -> int:
+    def choose(self, observation: Observation, arm_index: int) -> int:
         """The action of the central policy for a fleet of this arm."""
         return self._policy.act({"": observation})[""]
 
@@ -207,38 +207,40 @@ class Shared(ArrayPolicy):
         self._rng = rng
         self._instances: dict[int, ArrayPolicy] = {}
 
-    def choose(self, observation: Observation, place: int) -> int:
+    def choose(self, observation: Observation, arm_index: int) -> int:
         """The arm's own claim."""
         seen = LazyObservation(lambda name: np.asarray(getattr(observation, name))[None])
-        return int(self._claims([self.of(place)], seen, np.array([place]))[0])
+        return int(self._claims([self.of(arm_index)], seen, np.array([arm_index]))[0])
 
     @classmethod
     def decide(cls, policies: Sequence[Any], seen: Observation, arms: Sequence[str]) -> Array:
         """The claim of every arm by its own observation."""
         shape = seen.action_mask.shape[:2]
         each = LazyObservation(lambda name: (field := getattr(seen, name)).reshape(math.prod(shape), *field.shape[2:]))
-        central = [policy.of(place) for policy in policies for place in range(shape[1])]
+        central = [policy.of(arm_index) for policy in policies for arm_index in range(shape[1])]
         return cls._claims(central, each, np.tile(np.arange(shape[1]), shape[0])).reshape(shape)
 
-    def of(self, place: int) -> ArrayPolicy:
+    def of(self, arm_index: int) -> ArrayPolicy:
         """The instance of the central policy of the arm with this index."""
-        if place not in self._instances:
-            self._instances[place] = self.central()
-            self._instances[place].reset(self._rng)
-        return self._instances[place]
+        if arm_index not in self._instances:
+            self._instances[arm_index] = self.central()
+            self._instances[arm_index].reset(self._rng)
+        return self._instances[arm_index]
 
     @classmethod
-    def _claims(cls, policies: Sequence[ArrayPolicy], own: Observation, place: Array) -> Array:
+    def _claims(cls, policies: Sequence[ArrayPolicy], own: Observation, arm_index: Array) -> Array:
         """The claims of some arms, int [n].
 
         Args:
             policies: Instances of the central policy, [n].
             own: Observations of the arms, [n].
-            place: Their indices in their fleets, int [n].
+            arm_index: Their indices in their fleets, int [n].
         """
-        fleet = fleet_as_shared(own, place)
+        fleet = fleet_as_shared(own, arm_index)
         arms = [str(arm) for arm in range(fleet.working.shape[1])]
-        return cls.central.decide(policies, fleet, arms)[np.arange(len(place)), np.minimum(place, len(arms) - 1)]
+        return cls.central.decide(policies, fleet, arms)[
+            np.arange(len(arm_index)), np.minimum(arm_index, len(arms) - 1)
+        ]
 
 
 class EveryArm:

@@ -35,7 +35,7 @@ class RandomLegal(ArrayPolicy):
         """Begin a shift."""
         self._rng = rng
 
-    def choose(self, observation: Observation, place: int) -> int:
+    def choose(self, observation: Observation, arm_index: int) -> int:
         """A uniform choice among the legal claims; WAIT without one."""
         return int(self.decide([self], one_fleet([observation]), ("",))[0, 0])
 
@@ -84,38 +84,38 @@ class LeastDifficulty(ArrayPolicy):
     """The pair of free arm and job with the least difficulty relative to the fleet's average for that job first.
 
     With absolute difficulties no arm would claim a task that is new to every twin. Scope arm: each arm computes it from
-    its own scores, those its peers shared, and its place in the fleet, which breaks ties. Without any score, free arms
+    its own scores, those its peers shared, and its index in the fleet, which breaks ties. Without any score, free arms
     claim the oldest jobs in the fleet's order. `agents.staleness` discounts old messages.
     """
 
     scope: ClassVar = "arm"
     only_choices = True
 
-    def choose(self, observation: Observation, place: int) -> int:
+    def choose(self, observation: Observation, arm_index: int) -> int:
         """This arm's claim under the assumption that its peers follow the same rule."""
-        return int(_claims_of_arms(one_fleet([observation]), np.array([place]))[0, 0])
+        return int(_claims_of_arms(one_fleet([observation]), np.array([arm_index]))[0, 0])
 
     def actions(self, seen: Observation) -> Array:
         """The claim of every arm by its own observation."""
         return _claims_of_arms(seen, np.arange(seen.action_mask.shape[1]))
 
 
-def _claims_of_arms(seen: Observation, places: Array) -> Array:
-    """Actions of `LeastDifficulty`, int [env, arm], of the arms at some places, int [arm]."""
+def _claims_of_arms(seen: Observation, arm_indices: Array) -> Array:
+    """Actions of `LeastDifficulty`, int [env, arm], of the arms with these indices, int [arm]."""
     actions = np.full(seen.action_mask.shape[:2], WAIT)
     env, arm = np.nonzero(legal_options(seen).any(axis=-1))
     if not len(env):
         return actions
-    own, place = LazyObservation(lambda name: getattr(seen, name)[env, arm]), places[arm]  # [n, …]
+    own, arm_index = LazyObservation(lambda name: getattr(seen, name)[env, arm]), arm_indices[arm]  # [n, …]
     legal, slots = legal_options(own), own.offered.shape[-1]
     may, able = (each.reshape(len(env), slots, -1).any(axis=-1) for each in (legal, own.feasible > 0))
     # Not empty, and not closed only by a busy station.
-    relative = advantage(own, place, (own.offered > 0) & (may | ~able))
+    relative = advantage(own, arm_index, (own.offered > 0) & (may | ~able))
     free = free_peers(own)
-    able = ~np.isnan(relative) & in_fleet(free, place, True)[..., None]
-    mine = np.minimum(place, free.shape[-1])
+    able = ~np.isnan(relative) & in_fleet(free, arm_index, True)[..., None]
+    mine = np.minimum(arm_index, free.shape[-1])
     slot = cheapest_options(np.where(able, relative, np.inf).round(9))[np.arange(len(env)), mine]
-    before = (free & (np.arange(free.shape[-1]) < place[:, None])).sum(axis=-1)  # free arms that choose first
+    before = (free & (np.arange(free.shape[-1]) < arm_index[:, None])).sum(axis=-1)  # free arms that choose first
     in_order = (may & (may.cumsum(axis=-1) > np.minimum(before, may.sum(axis=-1) - 1)[:, None])).argmax(axis=-1)
     unknown = ~(legal & (own.known > 0)).any(axis=-1)
     slot = np.where((slot == NONE) & unknown, in_order, slot)

@@ -39,20 +39,20 @@ def known_difficulty(observation: Observation) -> Array:
     return np.where(observation.known > 0, observation.difficulty, np.nan)
 
 
-def in_fleet(peers: Array, place: Array | int, own: Array | float) -> Array:
+def in_fleet(peers: Array, arm_index: Array | int, own: Array | float) -> Array:
     """Values of the peers of an arm, [..., peer], with its own, [...], in the fleet's order, [..., arm].
 
     Args:
-        place: Index of the arm in the fleet, int [...].
+        arm_index: Index of the arm in the fleet, int [...].
     """
     arm = np.arange(peers.shape[-1] + 1)
-    place = np.minimum(np.asarray(place), peers.shape[-1])[..., None]
+    arm_index = np.minimum(np.asarray(arm_index), peers.shape[-1])[..., None]
     everyone = np.concatenate([peers, np.broadcast_to(own, peers.shape[:-1])[..., None]], axis=-1)
-    order = np.where(arm == place, len(arm) - 1, arm - (arm > place))
+    order = np.where(arm == arm_index, len(arm) - 1, arm - (arm > arm_index))
     return np.take_along_axis(everyone, np.broadcast_to(order, everyone.shape), axis=-1)
 
 
-def fleet_as_shared(own: Observation, place: Array) -> Observation:
+def fleet_as_shared(own: Observation, arm_index: Array) -> Observation:
     """What an arm knows of itself and of its peers, as if all these were observations of a fleet, [n, arm].
 
     A peer that should be home by now counts as free, and one that is free may claim what it has a plan for, if the
@@ -61,16 +61,16 @@ def fleet_as_shared(own: Observation, place: Array) -> Observation:
 
     Args:
         own: Observations of arms, [n].
-        place: Indices of the arms in the fleet, int [n].
+        arm_index: Indices of the arms in the fleet, int [n].
     """
     arms, plans = own.peers.shape[-1] + 1, own.duration_s.shape[-1] // own.group.shape[-1]
-    mine = (np.arange(arms) == np.minimum(place, arms - 1)[:, None])[..., None]  # [n, arm, 1]
+    mine = (np.arange(arms) == np.minimum(arm_index, arms - 1)[:, None])[..., None]  # [n, arm, 1]
 
     def each_arm(peers: Array, value: Array | float) -> Array:
-        return in_fleet(peers, place, value)
+        return in_fleet(peers, arm_index, value)
 
     def bids(peers: Array, value: Array) -> Array:
-        return np.swapaxes(in_fleet(np.swapaxes(peers, -1, -2), place[:, None], value), -1, -2)  # [n, arm, option]
+        return np.swapaxes(in_fleet(np.swapaxes(peers, -1, -2), arm_index[:, None], value), -1, -2)  # [n, arm, option]
 
     left_s = np.where(own.peer_working > 0, np.maximum(own.peer_busy_s - own.peer_age_s, 0.0), 0.0)
     working, faulted = each_arm(left_s > 0, own.working > 0), each_arm(own.peer_faulted > 0, own.faulted > 0)
@@ -104,20 +104,20 @@ def fleet_as_shared(own: Observation, place: Array) -> Observation:
     return LazyObservation(read, **fields)
 
 
-def advantage(observation: Observation, place: Array | int, open_slots: Array) -> Array:
+def advantage(observation: Observation, arm_index: Array | int, open_slots: Array) -> Array:
     """Least difficulty of each job for each arm relative to the fleet's average, as one arm knows it, [..., arm, slot].
 
     Args:
-        place: Index of this arm in the fleet, int [...].
+        arm_index: Index of this arm in the fleet, int [...].
         open_slots: Slots to compare, bool, [..., slot]; others are NaN, as are unknown difficulties.
     """
-    slots, place = observation.offered.shape[-1], np.asarray(place)
+    slots, arm_index = observation.offered.shape[-1], np.asarray(arm_index)
     difficulty = known_difficulty(observation)
     own = np.fmin.reduce(difficulty.reshape(*difficulty.shape[:-1], slots, -1), axis=-1)
     peers = np.where(observation.peer_known > 0, observation.peer_difficulty.astype(float), np.nan)
-    shared = in_fleet(np.swapaxes(peers, -1, -2), place[..., None], own)  # [..., slot, arm]
+    shared = in_fleet(np.swapaxes(peers, -1, -2), arm_index[..., None], own)  # [..., slot, arm]
     shared = np.where(open_slots[..., None], shared, np.nan)
-    weight = in_fleet(fading_weights(observation), place, 1.0)[..., None, :]
+    weight = in_fleet(fading_weights(observation), arm_index, 1.0)[..., None, :]
     unknown = np.isnan(shared)
     counts = np.where(unknown, 0.0, weight)
     total = counts.sum(axis=-1, keepdims=True)

@@ -130,7 +130,7 @@ def main() -> None:
     for scenario in CELLS:
         thermofleet("layout", scenario, "--out", str(PICTURES / "library" / f"{scenario}.png"), "--overwrite")
     trainings = sorted((ROOT / "docs" / "results" / "learned").glob("train-pairs-*"))
-    draw_curves(trainings, PICTURES / "learning_pairs.png", "normalised score")
+    draw_curves(trainings, PICTURES / "learning_pairs.png", "normalised score", teacher_name="bid_price")
     draw_knowledge(PICTURES / "knowledge.png")
     draw_amounts(PICTURES / "amounts.png")
     for picture in sorted(PICTURES.rglob("*.*")):

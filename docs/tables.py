@@ -434,7 +434,7 @@ BY_MESSAGES = "bid_price_shared"
 
 
 def by_bus(folder: Path) -> str:
-    """Worth of messages by the bus of the instances, with exact predictions and with those of twins."""
+    """Worth of messages by the bus of the instances, with exact predictions and with those of the source `twin`."""
     bus = {line.name: line.axes.bus for line in manifest("test")}
     by_source = [scored(folder, "test", source)[1] for source in ("oracle", SOURCE)]
     rows: list[tuple[str, ...]] = []
@@ -446,7 +446,8 @@ def by_bus(folder: Path) -> str:
             cells.append(shown(own.difference(BY_MESSAGES, ALONE)))
         rows.append((kind, str(sum(each == kind for each in bus.values())), *cells))
     policies = (f"`{BY_MESSAGES}`", f"`{ALONE}`", "difference")
-    heads = (*(f"{each}, exact" for each in policies), *(f"{each}, twins" for each in policies))
+    sources = ("true state", "corrected network (`twin`)")
+    heads = (f"{each}, {source}" for source in sources for each in policies)
     return table(("bus", "instances", *heads), rows)
 
 
@@ -562,7 +563,12 @@ def workers_table(path: Path) -> str:
 def commands_table(folder: Path) -> str:
     measured = json.loads((folder / "commands.json").read_text(encoding="utf-8"))
     rows = [
-        (f"`{each['command']}`", f"{each['cpu_s']:.0f}", f"{each['wall_s']:.0f}", f"{each['most_mb'] / 1000:.2f}")
+        (
+            re.sub("^[^,]+", r"`\g<0>`", each["command"]),  # as `show`, plans included
+            f"{each['cpu_s']:.0f}",
+            f"{each['wall_s']:.0f}",
+            f"{each['most_mb'] / 1000:.2f}",
+        )
         for each in measured["commands"]
     ]
     return table(("command", "CPU s", "s", "memory, GB"), rows)

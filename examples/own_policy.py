@@ -27,12 +27,12 @@ class Careful:
         """Begin a shift; sample all random numbers from `rng`."""
         self._rule.reset(rng)
 
-    def choose(self, observation, place):
+    def choose(self, observation, arm_index):
         """Return WAIT, or 1 + k to claim option k; fleet/observation.py defines the observation.
 
-        `place` is the arm's index in the fleet.
+        `arm_index` is the arm's index in the fleet.
         """
-        return WAIT if observation.headroom_k < HEADROOM_K else self._rule.choose(observation, place)
+        return WAIT if observation.headroom_k < HEADROOM_K else self._rule.choose(observation, arm_index)
 
 
 def main(horizon_s=7200, difficulty="twin"):

@@ -46,7 +46,7 @@ MEANINGS: dict[EventKind, Meaning] = {
     "finish": Meaning("The last cycle of the job is done.", "lateness, s; 0 if on time", live=True),
     "home": Meaning("The arm is at home and free again.", live=True),
     "warning": Meaning("The motor of `joint` passed its warning limit.", "temperature, °C", live=True),
-    "fault": Meaning("The motor of `joint` passed its fault limit: the arm stopped.", "temperature, °C", live=True),
+    "fault": Meaning("The motor of `joint` passed its error limit: the arm stopped.", "temperature, °C", live=True),
     "return": Meaning(
         "The job is open again: the arm faulted, or had to return it.", "cycles that are kept", live=True
     ),

@@ -133,7 +133,7 @@ class Observation:
         Array, Field("own", _OPTION, "s", 0, LONG_S, 1024, "time this arm needs for the rest of the job, 0: no plan")
     ]
     difficulty: Annotated[
-        Array, Field("own", _OPTION, "1", -1, JOINTS, 1, "own thermal difficulty d of the plan, -1 if unknown")
+        Array, Field("own", _OPTION, "1", -1, JOINTS, 1, "own difficulty d of the plan, -1 if unknown")
     ]
     peak_c: Annotated[
         Array, Field("own", _OPTION, "°C", -60, 300, 64, "predicted peak: hottest motor in the plan, 0 if unknown")

@@ -224,7 +224,7 @@ def test_a_run_without_figures_readings_or_events_still_has_a_report() -> None:
     run = {"status": "interrupted", "metrics": {"value": None, "availability": float("nan"), "peak_c": {}}}
     text = page(run, (), readings=telemetry(0))
     assert "unnamed scenario" in text
-    assert "No motor reached its fault limit" in text
+    assert "No motor reached its error limit" in text
     assert "nan%" not in text
     go.Figure(drawn(text))
 

@@ -224,7 +224,7 @@ class LearnedPolicy:
         """Begin a shift."""
         self._rng = rng
 
-    def choose(self, observation: Observation, place: int) -> int:
+    def choose(self, observation: Observation, arm_index: int) -> int:
         """An action of one arm; WAIT where there is no choice."""
         return self.act({"": observation})[""]
 

@@ -54,7 +54,7 @@ def submit_command(
     peak: predicted temperature of the hottest motor
     gained: peak minus the hottest motor now
     P: probability that a motor passes the warning limit
-    d: thermal difficulty, to compare arms on one job
+    d: difficulty, to compare arms on one job
     duration: from home to home
     finish in: time until the last cycle is done, after the arm's current jobs
     Exit code 1: a job was refused or stays unfinished; with --quote, no arm can do it.

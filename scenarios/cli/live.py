@@ -52,10 +52,10 @@ def up_command(
     page: bool = option(f"Also serve a live page (bus gateway --page), on port {PAGE_PORT} if free.", False),
     webhook: list[str] | None = _WEBHOOK,
 ) -> None:
-    """Start a fleet, one process per participant, and run it until its jobs are done.
+    """Start a fleet, one process per participant, and run it until its shift ends or all its jobs are settled.
 
-    A process that exits is restarted with back-off; Ctrl-C stops all in order. The same command with the same --out
-    continues from the journals. With --arms it starts a part of the fleet.
+    With --jobs none it runs until Ctrl-C. A process that exits is restarted with back-off; Ctrl-C stops all in order.
+    The same command with the same --out continues from the journals. With --arms it starts a part of the fleet.
     """
     from scenarios.live.fleet_processes import run_fleet
     from scenarios.result_folder import check_folder

@@ -144,8 +144,8 @@ class SuiteScores:
         """What a reader must know of the instances."""
         remarks = [
             f"Unit: {self.unit}{and_trainings(self.trainings)}. Score: 0 = mean of random, 1 = hindsight, the best "
-            "schedule that a search found, or a tenth of its reward above random if that is more. Mean of the "
-            f"hindsight: {self.reachable}."
+            "schedule that a search found. Scale: hindsight − random, at least a tenth of the hindsight's reward. "
+            f"Mean score of the hindsight: {self.reachable}."
         ]
         if self.missing:
             remarks.append(f"Shifts of each policy without a reference, which are not scored: {self.missing}.")

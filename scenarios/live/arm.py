@@ -70,7 +70,7 @@ def run_arm(
     rate_hz: float = STATE_HZ,
     capacity: int = 1,
 ) -> None:
-    """Run one arm of a fleet until its jobs are done, Ctrl-C or SIGTERM.
+    """Run one arm of a fleet until Ctrl-C or SIGTERM; with `alone` also until the shift ends or all jobs are settled.
 
     Args:
         alone: Allocate jobs with the peers by the policy of `spec`, without an auctioneer.

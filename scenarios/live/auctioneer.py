@@ -110,7 +110,9 @@ def central_allocation(
 
 
 def run_auctioneer(scenario: Scenario, name: str, spec: LiveSpec, endpoint: str) -> None:
-    """Run the auctioneer of a fleet until its jobs are settled, Ctrl-C or SIGTERM; its journal is `NAME.journal`.
+    """Run the auctioneer of a fleet until its shift ends, its jobs are settled, or Ctrl-C or SIGTERM.
+
+    Its journal is `NAME.journal`. With `jobs` "none" only Ctrl-C or SIGTERM ends it.
 
     Raises:
         FleetError: the policy is not central, or the journals are of a shift without an auctioneer.

@@ -118,7 +118,9 @@ def run_fleet(
     page: bool = False,
     webhooks: Sequence[str] = (),
 ) -> None:
-    """Start a fleet, or a part of it, and keep it running until its jobs are done, Ctrl-C or SIGTERM.
+    """Start a fleet, or a part of it, and keep it running until its shift ends, its jobs are settled, or it is stopped.
+
+    With `jobs` "none" only Ctrl-C or SIGTERM ends it.
 
     Raises:
         FleetError: options contradict each other or the journals, or a process cannot be started.

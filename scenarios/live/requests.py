@@ -173,7 +173,7 @@ def read_jobs(file: str, begin: str = "") -> dict[int, JobSpec]:
         begin: Date, time and zone of fleet time 0, for the dates in a job table.
 
     Raises:
-        FleetError: a job is invalid; names the line, or the index in the list. Of a job table all faults are named.
+        FleetError: a job is invalid; names the line, or the index in the list. Of a job table all errors are named.
     """
     shift = shift_begin(begin, "--shift-begin")
     if file.lower().endswith(SUFFIXES):

@@ -119,9 +119,9 @@ def _outside_shift(scenario: Mapping[str, Any]) -> Iterable[str]:
 def _hottest(metrics: Mapping[str, Any]) -> str:
     peaks_c = _peaks(metrics)
     if not peaks_c:
-        return "No motor reached its fault limit."
+        return "No motor reached its error limit."
     arm = max(peaks_c, key=lambda arm: peaks_c[arm])
-    return f"No motor reached its fault limit; the hottest, in {arm}, reached {peaks_c[arm]:.0f} °C."
+    return f"No motor reached its error limit; the hottest, in {arm}, reached {peaks_c[arm]:.0f} °C."
 
 
 def _fault(fault: Event, log: ShiftLog) -> str:

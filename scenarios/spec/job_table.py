@@ -34,7 +34,7 @@ _LOG = logging.getLogger(__name__)
 SUFFIXES = (".csv", ".tsv", ".parquet", ".xlsx")
 """Of job tables; other files of jobs are JSON."""
 MOST_ROWS, MOST_BYTES = 10_000, 20_000_000
-MOST_NUMBERS, MOST_FAULTS = 5, 100
+MOST_NUMBERS, MOST_ERRORS = 5, 100
 """Row numbers in one sentence, and sentences on one table."""
 MOST_COLUMNS = 100
 """Of a sheet."""
@@ -308,29 +308,29 @@ _UNIT = re.compile("ms|s|sec|mins?|minutes|h|hrs?|hours|d|days|mg|g|kg|t|oz|lbs?
 """Of headings; a column has those in `_SPELLINGS` only, so that no numbers of another one are taken."""
 
 
-class _Faults(dict[tuple[str, str], list[int]]):
-    """Rows of each fault, by column and sentence."""
+class _Errors(dict[tuple[str, str], list[int]]):
+    """Rows of each error, by column and sentence."""
 
     def add(self, row: int, column: str, sentence: str) -> None:
         self.setdefault((column, sentence.rstrip(".")), []).append(row)
 
     def lines(self) -> list[str]:
-        """A sentence for each kind of fault, with its rows and column."""
+        """A sentence for each kind of error, with its rows and column."""
         lines = list[str]()
-        for (column, sentence), rows in islice(self.items(), MOST_FAULTS):
+        for (column, sentence), rows in islice(self.items(), MOST_ERRORS):
             more = f" and {len(rows) - MOST_NUMBERS} more" if len(rows) > MOST_NUMBERS else ""
             numbers = f"row{'s' * (len(rows) > 1)} {', '.join(map(str, rows[:MOST_NUMBERS]))}{more}"
             lines.append(f"  {numbers}{f', column {column}' if column else ''}: {sentence}.")
-        if len(self) > MOST_FAULTS:
-            lines.append(f"  … and {len(self) - MOST_FAULTS} more kinds of faults.")
+        if len(self) > MOST_ERRORS:
+            lines.append(f"  … and {len(self) - MOST_ERRORS} more kinds of errors.")
         return lines
 
     def raise_any(self, where: str) -> None:
-        """Raise a ScenarioError with all faults, if there are any."""
+        """Raise a ScenarioError with all errors, if there are any."""
         if not self:
             return
         total, lines = sum(map(len, self.values())), self.lines()
-        raise ScenarioError("\n".join([f"{where} has {total} fault{'s' * (total > 1)}:", *lines]))
+        raise ScenarioError("\n".join([f"{where} has {total} error{'s' * (total > 1)}:", *lines]))
 
 
 def read_job_table(
@@ -353,45 +353,45 @@ def read_job_table(
         closed: Whether `after` must name rows of the table.
 
     Raises:
-        ScenarioError: the file cannot be read, or rows are wrong: all faults, each with its row and column.
+        ScenarioError: the file cannot be read, or rows are wrong: all errors, each with its row and column.
         MissingExtra: the library for an XLSX file is not installed.
     """
-    where, faults, doubts, jobs = where or str(file), _Faults(), _Faults(), dict[int, JobSpec]()
+    where, errors, doubts, jobs = where or str(file), _Errors(), _Errors(), dict[int, JobSpec]()
     lines, decimal_comma = _rows(file, where)
     is_sheet = isinstance(file, Path) and file.suffix.lower() == ".xlsx"
     head_row, head = next(lines, (1, ()))
     if len(head) > MOST_COLUMNS:
         raise ScenarioError(f"{where} has {len(head)} columns; a job table has at most {MOST_COLUMNS}.")
-    columns, dialect = _read_head(head_row, head, faults), _Dialect(begin, decimal_comma, horizon_s, is_sheet)
-    faults.raise_any(where)
+    columns, dialect = _read_head(head_row, head, errors), _Dialect(begin, decimal_comma, horizon_s, is_sheet)
+    errors.raise_any(where)
     no_place = _no_place(places or ())
     rows: dict[str, tuple[int, Row]] = {}
     for count, (number, cells) in enumerate(lines):
         if count == MOST_ROWS:
             raise ScenarioError(f"{where} has too many rows; a job table has at most {MOST_ROWS}.")
         if len(cells) > len(head) and not all(map(_is_empty, cells[len(head) :])):
-            faults.add(number, "", f"{len(cells)} cells, but the head has {len(head)}; quote cells with separators")
+            errors.add(number, "", f"{len(cells)} cells, but the head has {len(head)}; quote cells with separators")
             continue
-        row, wrong = _read_row(number, cells, columns, dialect, faults, doubts)
+        row, wrong = _read_row(number, cells, columns, dialect, errors, doubts)
         for field, sentence in _problems(row, wrong):
-            faults.add(number, _COLUMN_OF[field], sentence)
+            errors.add(number, _COLUMN_OF[field], sentence)
             wrong.add(field)
         for name in dict.fromkeys(row.places) if places is not None and "every_places" not in wrong else ():
             if name not in places:
-                faults.add(number, "places", no_place(name))
+                errors.add(number, "places", no_place(name))
         if row.name and row.name in rows:
-            faults.add(number, "name", f"'{row.name}' is the name of row {rows[row.name][0]}, too; names are unique")
+            errors.add(number, "name", f"'{row.name}' is the name of row {rows[row.name][0]}, too; names are unique")
         elif not wrong:
             fields = {**vars(row), "places": row.every_places[0], "alternatives": row.every_places[1:]}
             jobs[number] = JobSpec(**{name: value for name, value in fields.items() if name != "every_places"})
         rows.setdefault(row.name, (number, row))
     heaviest_kg = max((row.payload_kg for _, row in rows.values()), default=0.0)
     if ("payload", GRAMS) in columns.values() and 0.0 < heaviest_kg < LIGHT_KG:
-        faults.add(
+        errors.add(
             head_row, "payload_g", f"are these kg? The heaviest is {heaviest_kg / GRAMS:g}. Give kg in a column payload"
         )
-    _check_after(rows, faults, closed=closed)
-    faults.raise_any(where)
+    _check_after(rows, errors, closed=closed)
+    errors.raise_any(where)
     for sentence in doubts.lines():
         _LOG.warning("%s,%s", where, sentence[1:])
     if not jobs:
@@ -400,26 +400,26 @@ def read_job_table(
 
 
 def check_places(jobs: Mapping[int, JobSpec], places: Collection[str], where: str) -> None:
-    """Check the places of a table that was read without them; raises a ScenarioError with all faults.
+    """Check the places of a table that was read without them; raises a ScenarioError with all errors.
 
     Args:
         jobs: By the numbers of their rows.
         where: As in `read_job_table`, as are `places`.
     """
-    faults, no_place = _Faults(), _no_place(places)
+    errors, no_place = _Errors(), _no_place(places)
     for number, job in jobs.items():
         for name in dict.fromkeys(chain.from_iterable(job.every_places)):
             if name not in places:
-                faults.add(number, "places", no_place(name))
-    faults.raise_any(where)
+                errors.add(number, "places", no_place(name))
+    errors.raise_any(where)
 
 
 def _no_place(places: Collection[str]) -> Callable[[str], str]:
-    """The fault of a place that a cell does not have, by its name."""
+    """The error of a place that a cell does not have, by its name."""
     return cache(lambda name: f"no place '{printable(name)}'{nearest(name, places)}")
 
 
-def _read_head(number: int, head: Sequence[Cell], faults: _Faults) -> dict[int, tuple[str, float]]:
+def _read_head(number: int, head: Sequence[Cell], errors: _Errors) -> dict[int, tuple[str, float]]:
     """Column and factor of its unit by index; a heading that begins with # is left out."""
     columns: dict[int, tuple[str, float]] = {}
     for i, heading in enumerate(head):
@@ -431,17 +431,17 @@ def _read_head(number: int, head: Sequence[Cell], faults: _Faults) -> dict[int, 
         stem, _, unit = key.rpartition("_")
         if not column and stem in _COLUMNS and _UNIT.fullmatch(unit):
             known = [each for each, (of, _) in _SPELLINGS.items() if of == stem and each.startswith(stem)]
-            faults.add(number, text, f"unknown unit of '{stem}'. Convert its numbers; allowed are {', '.join(known)}")
+            errors.add(number, text, f"unknown unit of '{stem}'. Convert its numbers; allowed are {', '.join(known)}")
         elif not column:
             close = get_close_matches(key, _SPELLINGS, n=1)
             hint = f"; did you mean '{close[0]}'?" if close else "."
-            faults.add(number, text, f"unknown{hint} Allowed: {', '.join(_COLUMNS)}. Put # before it to ignore it")
+            errors.add(number, text, f"unknown{hint} Allowed: {', '.join(_COLUMNS)}. Put # before it to ignore it")
         elif column in (known for known, _ in columns.values()):
-            faults.add(number, text, f"there is another column '{column}'; keep one")
+            errors.add(number, text, f"there is another column '{column}'; keep one")
         else:
             columns[i] = column, factor
     if missing := [name for name in _NEEDED if name not in {column for column, _ in columns.values()}]:
-        faults.add(number, "", f"no column {' and no column '.join(missing)}; every job needs {', '.join(_NEEDED)}")
+        errors.add(number, "", f"no column {' and no column '.join(missing)}; every job needs {', '.join(_NEEDED)}")
     return columns
 
 
@@ -450,8 +450,8 @@ def _read_row(
     cells: Sequence[Cell],
     columns: Mapping[int, tuple[str, float]],
     dialect: _Dialect,
-    faults: _Faults,
-    doubts: _Faults,
+    errors: _Errors,
+    doubts: _Errors,
 ) -> tuple[Row, set[str]]:
     """Values of a row, and the fields whose cells cannot be read."""
     row, wrong = Row(**{field: default for field, _, default in _COLUMNS.values()}), set[str]()
@@ -465,14 +465,14 @@ def _read_row(
             elif column in _NEEDED:
                 raise ValueError("is empty; every job needs one")
         except ValueError as error:
-            faults.add(number, column, str(error))
+            errors.add(number, column, str(error))
             wrong.add(field)
     row.places = tuple(name for names in row.every_places for name in names)
     return row, wrong
 
 
 def _problems(row: Row, wrong: Collection[str]) -> Iterator[tuple[str, str]]:
-    """Field and sentence of each fault in the values of a row, at most one a field."""
+    """Field and sentence of each error in the values of a row, at most one a field."""
     checks: list[tuple[str, Callable[[], None]]] = [
         *((field, lambda field=field: check_bounds(row, field)) for field in BOUNDS if hasattr(row, field)),
         *((field, lambda field=field: check_names(row, field, of_jobs=True)) for field in ("name", "after")),
@@ -521,13 +521,13 @@ def with_cell(answer: Answer, jobs: Mapping[str, tuple[str, JobSpec]]) -> Answer
     return replace(answer, reason=f"{place}: {answer.reason}")
 
 
-def _check_after(rows: Mapping[str, tuple[int, Row]], faults: _Faults, *, closed: bool) -> None:
+def _check_after(rows: Mapping[str, tuple[int, Row]], errors: _Errors, *, closed: bool) -> None:
     for number, row in rows.values() if closed else ():
         for name in row.after:
             if name not in rows:
-                faults.add(number, "after", f"there is no job '{printable(name)}' in this table")
+                errors.add(number, "after", f"there is no job '{printable(name)}' in this table")
     if cycle := cycle_of({name: row.after for name, (_, row) in rows.items()}):
-        faults.add(rows[cycle[0]][0], "after", f"jobs wait for each other in a cycle: {' → '.join(cycle)}")
+        errors.add(rows[cycle[0]][0], "after", f"jobs wait for each other in a cycle: {' → '.join(cycle)}")
 
 
 def cycle_of(after: Mapping[str, Sequence[str]]) -> list[str]:

@@ -221,7 +221,7 @@ def _with_tables(raw: Mapping[str, object], path: Path) -> Mapping[str, object]:
     begin = shift_begin(raw.get("shift_begin"), f"{path.name}: shift_begin", zone)
     places, horizon_s = raw.get("places"), _number(raw.get("horizon_s"))
     least_s = _number(raw.get("decision_interval_s", Scenario.decision_interval_s))
-    # Their own faults are reported when the scenario is made.
+    # Their own errors are reported when the scenario is made.
     horizon_s = float(horizon_s) if 0 < horizon_s < MOST_S and least_s <= horizon_s else 0.0
     raw = with_calendar(raw, begin, horizon_s, path.name) | {"shift_begin": begin and begin.isoformat()}
     jobs = raw.get("jobs")
@@ -229,7 +229,7 @@ def _with_tables(raw: Mapping[str, object], path: Path) -> Mapping[str, object]:
         return raw
     tables = [place for place in places if isinstance(place, Mapping)] if isinstance(places, list) else []
     names = [place["name"] for place in tables if isinstance(place.get("name"), str)]
-    streams, more, faults = list(jobs), list[object](), list[str]()
+    streams, more, errors = list(jobs), list[object](), list[str]()
     for i, each in enumerate(jobs):
         if not isinstance(each, Mapping) or "table" not in each:
             continue
@@ -243,13 +243,13 @@ def _with_tables(raw: Mapping[str, object], path: Path) -> Mapping[str, object]:
             labels = [f"row {n}, '{row.name}'," for n, row in rows.items()]
             check_times([row.release_s for row in rows.values()], horizon_s, where, labels)
         except ScenarioError as error:
-            faults.append(str(error))
+            errors.append(str(error))
             continue
         # The others follow at the end, so that each entry of the file keeps its index.
         streams[i], *rest = [stream_fields(row, horizon_s, f"'{file.name}', row {n}") for n, row in rows.items()]
         more += rest
-    if faults:
-        raise ScenarioError("\n".join(faults))
+    if errors:
+        raise ScenarioError("\n".join(errors))
     return {**raw, "jobs": streams + more}
 
 
@@ -314,16 +314,16 @@ def _check(scenario: Scenario, path: Path) -> None:
         raise ScenarioError(f"{file}: arms: there are no arms; give at least one [[arms]].")
     if not scenario.jobs:
         raise ScenarioError(f"{file}: jobs: there are no jobs; give at least one [[jobs]].")
-    faults = list[str]()
+    errors = list[str]()
     for kind in ("arms", "places", "fixtures", "jobs"):
         first = dict[str, str]()
         for i, item in enumerate(getattr(scenario, kind)):
             place = item.place_of(i, "name") if isinstance(item, JobStream) else f"{kind}[{i}].name"
             if item.name in first:
-                faults.append(f"{place}: '{item.name}' is given twice, as in {first[item.name]}; names must be unique.")
+                errors.append(f"{place}: '{item.name}' is given twice, as in {first[item.name]}; names must be unique.")
             first.setdefault(item.name, place)
-        if faults and kind != "jobs":
-            raise ScenarioError(f"{file}: {faults[0]}")
+        if errors and kind != "jobs":
+            raise ScenarioError(f"{file}: {errors[0]}")
     for (i, one), (j, other) in combinations(enumerate(scenario.arms), 2):
         apart = dist(one.position_m, other.position_m)
         if apart < APART_M:
@@ -337,24 +337,24 @@ def _check(scenario: Scenario, path: Path) -> None:
     for i, stream in enumerate(scenario.jobs):
         for name in chain.from_iterable(stream.alternatives):
             if name not in places:
-                faults.append(f"{stream.place_of(i, 'places')}: no place '{name}'{nearest(name, places)}")
+                errors.append(f"{stream.place_of(i, 'places')}: no place '{name}'{nearest(name, places)}")
         for names in stream.alternatives:
             if len({places.get(name, name) for name in names}) < len(set(names)):
-                faults.append(f"{stream.place_of(i, 'places')}: {' and '.join(names)} are at one point.")
+                errors.append(f"{stream.place_of(i, 'places')}: {' and '.join(names)} are at one point.")
         for name in stream.after:
             if name not in ({*streams[:i], *rows} if stream.numbered else known_streams):
                 known = nearest(name, streams[:i]) if i else "."
-                faults.append(f"{stream.place_of(i, 'after')}: there is no stream '{name}' above this one{known}")
-    if not faults and (cycle := cycle_of({stream.name: stream.after for stream in scenario.jobs})):
-        faults.append(f"jobs: jobs wait for each other in a cycle: {' → '.join(cycle)}.")
+                errors.append(f"{stream.place_of(i, 'after')}: there is no stream '{name}' above this one{known}")
+    if not errors and (cycle := cycle_of({stream.name: stream.after for stream in scenario.jobs})):
+        errors.append(f"jobs: jobs wait for each other in a cycle: {' → '.join(cycle)}.")
     numbered = {stream.name for stream in scenario.jobs if stream.numbered}
     for i, name in enumerate(streams if numbered else ()):
         stream, _, number = name.rpartition("-")
         if name not in numbered and stream in numbered and len(number) >= 3 and number.isdecimal():
             place = scenario.jobs[i].place_of(i, "name")
-            faults.append(f"{place}: '{name}' is also a job of the stream '{stream}'; rename one of them.")
-    if faults:
-        raise ScenarioError("\n".join(f"{file}: {fault}" for fault in faults))
+            errors.append(f"{place}: '{name}' is also a job of the stream '{stream}'; rename one of them.")
+    if errors:
+        raise ScenarioError("\n".join(f"{file}: {error}" for error in errors))
     check_breaks(scenario, file)
     _check_intervals(scenario, file)
     try:

@@ -93,6 +93,7 @@ class NetworkLearner:
 
     def __init__(self, library: Library, weights: RewardWeights, config: PpoConfig, count: int) -> None:
         self.library, self.weights, self.config = library, weights, config
+        self.teacher_name = config.warm_start
         self.search = trainer_of(library, weights, config)
         # In intervals, as in `run` and in a live fleet, where an arm above its limit is asked more often than in
         # training.

@@ -146,7 +146,7 @@ class PairLearner:
         count: Instances of an iteration.
     """
 
-    state_file, unit, curves = PAIRS_STATE, "normalised score", ()
+    state_file, unit, curves, teacher_name = PAIRS_STATE, "normalised score", (), "bid_price"
 
     def __init__(
         self,

@@ -30,6 +30,8 @@ class Learner(Protocol):
     """Of a validation."""
     curves: tuple[str, ...]
     """Numbers of an iteration that are plotted."""
+    teacher_name: str
+    """Policy that the training begins with; "" without one."""
     search: Any
     """`agents.learned.evolution.Evolution` or `agents.learned.ppo.Trainer`."""
 
@@ -131,7 +133,7 @@ def run_training(
         interrupted = True
     if validated < search.done:
         validate()
-    draw_curves([out], out / CURVE, learner.unit, learner.curves)
+    draw_curves([out], out / CURVE, learner.unit, learner.curves, teacher_name=learner.teacher_name)
     return Trained(search.done, _kept(out), best, time.monotonic() - began_s, interrupted)
 
 
@@ -180,12 +182,15 @@ def _write_card(out: Path, card: Mapping[str, Any]) -> None:
         draft.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
 
 
-def draw_curves(folders: Sequence[Path], picture: Path, unit: str, curves: Sequence[str] = ()) -> None:
+def draw_curves(
+    folders: Sequence[Path], picture: Path, unit: str, curves: Sequence[str] = (), *, teacher_name: str
+) -> None:
     """Plot the validation of trainings against the iteration with that of their teacher; below it some numbers.
 
     Args:
         unit: Of a validation.
         curves: Names of the numbers of an iteration.
+        teacher_name: Policy that the trainings begin with; "" without one.
     """
     from matplotlib.figure import Figure  # without a display
 
@@ -204,7 +209,7 @@ def draw_curves(folders: Sequence[Path], picture: Path, unit: str, curves: Seque
                 label = name.replace("_", " ")
                 axes.plot([row["number"] for row in iterations], [row[name] for row in iterations], label=label)
     if teacher is not None:
-        top.axhline(teacher, color="k", lw=1, ls="--", label="teacher")
+        top.axhline(teacher, color="k", lw=1, ls="--", label=teacher_name)
     top.set_ylabel(f"validation, {unit}")
     for axes in (top, *below):
         axes.legend(frameon=False)

@@ -16,7 +16,7 @@ def observation(
     *,
     plans: int = 1,
     peers: int = 0,
-    place: int = 0,
+    arm_index: int = 0,
     legal: Any = 1,
     gives_back: bool = False,
     slack_s: Any = None,
@@ -28,14 +28,14 @@ def observation(
     no end, and all else is 0.
 
     Args:
-        place: Index of the arm in the fleet.
+        arm_index: Index of the arm in the fleet.
         legal: Whether each option may be claimed, [option] or one for all.
         slack_s: Of each slot, for `due_in_s`.
     """
     layout = Layout(peers + 1, slots, plans=plans, bids=True)
     mask = np.concatenate([[1], np.broadcast_to(legal, slots * plans), [gives_back]]).astype(np.int8)
     blank = layout.read(np.zeros((peers + 1, layout.size), np.float32), np.tile(mask, (peers + 1, 1)))
-    first = Observation(**{name: getattr(blank, name)[place] for name in NAMES})
+    first = Observation(**{name: getattr(blank, name)[arm_index] for name in NAMES})
     base = {
         "left_s": np.array(LONG_S),
         "group": np.arange(1.0, slots + 1.0),

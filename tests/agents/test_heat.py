@@ -246,7 +246,7 @@ def test_the_job_that_is_given_back_is_the_one_that_was_claimed() -> None:
         def reset(self, rng) -> None:
             """Nothing to reset."""
 
-        def choose(self, observation, place) -> int:
+        def choose(self, observation, arm_index) -> int:
             return 1 + 2 * self.slot if observation.action_mask[1 + 2 * self.slot] else WAIT
 
     for slot, given_back in ((0, WAIT), (1, 5)):

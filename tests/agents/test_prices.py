@@ -155,12 +155,12 @@ def shared(seen: dict[str, Observation], *, age_s: float = 0.0) -> dict[str, Obs
     """The same, with messages of this age: an arm knows of the other what that knows of itself."""
     together = {name: np.stack([getattr(each, own) for each in seen.values()]) for name, own in OWN.items()}
 
-    def with_messages(place: int, each: Observation) -> Observation:
-        peers = np.array([a for a in range(len(seen)) if a != place])
-        ages_s = np.where(np.arange(len(seen)) == place, 0.0, age_s)
+    def with_messages(arm_index: int, each: Observation) -> Observation:
+        peers = np.array([a for a in range(len(seen)) if a != arm_index])
+        ages_s = np.where(np.arange(len(seen)) == arm_index, 0.0, age_s)
         return LazyObservation(lambda name: getattr(each, name), **together, fleet_age_s=ages_s, peers=peers)
 
-    return {name: with_messages(place, each) for place, (name, each) in enumerate(seen.items())}
+    return {name: with_messages(arm_index, each) for arm_index, (name, each) in enumerate(seen.items())}
 
 
 OWN = {f"fleet_{name}": name for name in ("working", "faulted", "busy_s", "headroom_k", *BIDS.values())} | {

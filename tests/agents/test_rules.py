@@ -45,7 +45,7 @@ def fleet(
         return observation(
             slots,
             peers=arms - 1,
-            place=me,
+            arm_index=me,
             legal=legal[me],
             working=1.0 - idle[me],
             value=np.ones(slots),

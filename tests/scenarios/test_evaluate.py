@@ -251,13 +251,13 @@ def test_where_heat_binds_has_a_mean_of_its_own():
     assert found.cool is not None
     assert (found.hot.mean, found.cool.mean) == pytest.approx((0.4, 0.9))
     assert values.reachable == "0.80 (1.00 where heat binds, 0.40 where it does not)"
-    assert f"Mean of the hindsight: {values.reachable}." in scores_of(values, "a").remarks[0]
+    assert f"Mean score of the hindsight: {values.reachable}." in scores_of(values, "a").remarks[0]
     other = replace(values, instances=("quickstart/1", *values.instances[1:]))
     assert scores_of(other, "a").policies["a"].hot is None
 
 
 def test_trainings_of_a_policy_are_a_sample_and_those_of_twins_are_not():
-    rewards = {0: 15.0, 1: 40.0, 2: 5.0}
+    rewards: dict[int, float | None] = {0: 15.0, 1: 40.0, 2: 5.0}
     by_policy = {"pairs-*": rows_of("pairs-*", rewards, 3), "a": rows_of("a", {0: 12.0, 1: 30.0, 2: 5.0})}
     values = scored(by_policy, REFERENCES)
     assert values is not None
@@ -319,7 +319,7 @@ def test_of_several_references_of_a_shift_that_with_the_compared_predictions_cou
 
 def test_a_policy_that_declares_to_read_no_messages_cannot_read_them(scenario, plans, tmp_path):
     """Otherwise it would see all of them on a channel that loses most."""
-    body = "    def reset(self, rng): pass\n    def choose(self, seen, place): return int(seen.{} is None)\n"
+    body = "    def reset(self, rng): pass\n    def choose(self, seen, arm_index): return int(seen.{} is None)\n"
     for name, field in (("fleet", "fleet_busy_s"), ("peer", "peer_working"), ("own", "busy_s")):
         text = f"class Deaf:\n    scope, reads_messages = 'arm', False\n{body.format(field)}"
         (tmp_path / f"{name}.py").write_text(text, encoding="utf-8")

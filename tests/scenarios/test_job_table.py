@@ -1,4 +1,4 @@
-"""A job table gives the jobs of its rows, in any common file format, or all its faults with row and column."""
+"""A job table gives the jobs of its rows, in any common file format, or all its errors with row and column."""
 
 import csv
 import io
@@ -73,7 +73,7 @@ def drawn(scenario: Scenario, seed: int) -> tuple[Job, ...]:
     return draw_jobs(scenario, np.random.SeedSequence(seed))
 
 
-def faults_of(folder: Path, text: str, more: str = "") -> str:
+def errors_of(folder: Path, text: str, more: str = "") -> str:
     with pytest.raises(ScenarioError) as error:
         small_table(folder, text, more)
     return str(error.value)
@@ -117,7 +117,7 @@ def test_the_begin_of_the_shift_is_a_date_of_toml_or_a_text(tmp_path):
     for begin in ("2026-11-23T06:00:00+01:00", '"2026-11-23T06:00+01:00"'):
         assert drawn(small_table(tmp_path, text, f"shift_begin = {begin}"), 0)[0].release_s == 60.0
     for begin in ("2026-11-23T06:00:00", '"Monday"', "6"):
-        told = faults_of(tmp_path, text, f"shift_begin = {begin}")
+        told = errors_of(tmp_path, text, f"shift_begin = {begin}")
         assert "cell.toml: shift_begin must be a date with time and zone, as 2026-11-23T06:00+01:00 (got" in told
 
 
@@ -214,7 +214,7 @@ def test_a_submitted_table_gives_the_jobs_of_the_scenario(tmp_path):
 
 
 GOOD = "good,hold,bench,2,1,0,60,no,1,"
-FAULTS = {
+ERRORS = {
     "x,hold,bnch,,,,,,,": "column places: no place 'bnch'; did you mean 'bench'? Allowed: bench, shelf.",
     "x,hld,bench,,,,,,,": "column kind: 'hld' is no kind of job; did you mean 'hold'? Allowed: hold, pick_place, ",
     "x,hold,bench > shelf,,,,,,,": "column places: must be one place for a hold (got bench, shelf).",
@@ -241,21 +241,21 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize(("row", "sentence"), FAULTS.items(), ids=FAULTS)
-def test_a_fault_is_told_with_row_column_value_and_what_is_allowed(tmp_path, row, sentence):
-    told = faults_of(tmp_path, "\n".join([SHORT, GOOD, row]))
-    assert told.startswith("cell.toml: jobs[0].table: 'jobs.csv' has 1 fault:\n  row 3")
+@pytest.mark.parametrize(("row", "sentence"), ERRORS.items(), ids=ERRORS)
+def test_an_error_is_told_with_row_column_value_and_what_is_allowed(tmp_path, row, sentence):
+    told = errors_of(tmp_path, "\n".join([SHORT, GOOD, row]))
+    assert told.startswith("cell.toml: jobs[0].table: 'jobs.csv' has 1 error:\n  row 3")
     assert sentence in told
 
 
-def test_all_faults_are_told_at_once_and_equal_ones_together(tmp_path):
-    planted = [row for row in FAULTS if row[0] == "x" and row[-1] not in "xy"]
+def test_all_errors_are_told_at_once_and_equal_ones_together(tmp_path):
+    planted = [row for row in ERRORS if row[0] == "x" and row[-1] not in "xy"]
     rows = [row.replace("x", f"x{i}", 1) for i, row in enumerate(planted)]
-    told = faults_of(tmp_path, "\n".join([SHORT, GOOD, *rows, "z,hold,bnch,,,,,,,"]))
-    assert f"has {len(rows) + 1} faults:" in told
+    told = errors_of(tmp_path, "\n".join([SHORT, GOOD, *rows, "z,hold,bnch,,,,,,,"]))
+    assert f"has {len(rows) + 1} errors:" in told
     assert "rows 3, " in told
     for i, row in enumerate(planted):
-        assert FAULTS[row] in told, row
+        assert ERRORS[row] in told, row
         assert f"row {i + 3}" in told or not i
 
 
@@ -275,7 +275,7 @@ def test_what_a_german_spreadsheet_writes_is_read_or_asked_about(tmp_path):
         ("a;hold;bench;;;;2026-11-24;;;", "column due: a date needs a time, as 2026-11-24T14:00 (got '2026-11-24')"),
         ("a;hold;bench;;;6:01;5:00;;;", "column due: '5:00' is outside the shift, which begins at 06:00 and"),
     ):
-        assert sentence in faults_of(tmp_path, f"{SHORT.replace(',', ';')}\n{row}\n", begin)
+        assert sentence in errors_of(tmp_path, f"{SHORT.replace(',', ';')}\n{row}\n", begin)
 
 
 def test_a_time_of_day_that_summer_time_leaves_out_is_told(tmp_path):
@@ -285,8 +285,8 @@ def test_a_time_of_day_that_summer_time_leaves_out_is_told(tmp_path):
         if exists:
             assert drawn(small_table(tmp_path, text, begin), 0)[0].release_s == 60.0
         else:
-            faults = faults_of(tmp_path, text, begin)
-            assert f"column release: '{release}' does not exist: summer time leaves out this hour" in faults
+            errors = errors_of(tmp_path, text, begin)
+            assert f"column release: '{release}' does not exist: summer time leaves out this hour" in errors
 
 
 def test_a_time_of_day_that_occurs_twice_is_told(tmp_path, caplog):
@@ -372,14 +372,14 @@ HEADS = {
     "name,kind,places,paylod": "column paylod: unknown; did you mean 'payload'? Allowed: name, kind, places",
     "name,kind": "row 1: no column places; every job needs name, kind, places.",
     "name,kind,places,due,due_s": "column due_s: there is another column 'due'; keep one.",
-    "": "has 1 fault:\n  row 1: no column name and no column kind and no column places",
+    "": "has 1 error:\n  row 1: no column name and no column kind and no column places",
     "name,kind,places": "'jobs.csv' has no jobs; give a row of headings, then one row for each job.",
 }
 
 
 @pytest.mark.parametrize(("head", "sentence"), HEADS.items(), ids=HEADS)
 def test_a_wrong_head_is_told(tmp_path, head, sentence):
-    assert sentence in faults_of(tmp_path, head + "\n")
+    assert sentence in errors_of(tmp_path, head + "\n")
 
 
 def test_a_file_that_is_no_table_is_told(tmp_path):
@@ -415,12 +415,12 @@ SOON_S = 2.0
 """Of the processor, also of a slow one; with a fast one it takes a tenth."""
 
 
-def test_a_thousand_rows_are_read_and_all_their_faults_told_soon(tmp_path):
+def test_a_thousand_rows_are_read_and_all_their_errors_told_soon(tmp_path):
     kinds = [f"j{i},hld,bnch{i},{20 + i},0.5,soon,-1,maybe,-2,k{i}" for i in range(1000)]
     began_s = time.process_time()
-    told = faults_of(tmp_path, "\n".join([SHORT, *kinds]))
+    told = errors_of(tmp_path, "\n".join([SHORT, *kinds]))
     assert time.process_time() - began_s < SOON_S
-    assert f"has {9 * 1000} faults" in told
+    assert f"has {9 * 1000} errors" in told
     rows = [f"j{i},hold,bench | shelf,2,1,{i % 180},{i + 1000},yes,1,{f'j{i - 1}' * (i > 0)}" for i in range(1000)]
     began_s = time.process_time()
     assert len(small_table(tmp_path, "\n".join([SHORT, *rows])).jobs) == 1000
@@ -456,10 +456,10 @@ def test_rows_outside_the_shift_are_counted(tmp_path, caplog, plans):
     log = run(prepare(scenario, difficulty="blind", cache=plans), policy="edd", difficulty="blind")
     assert "2 of 5 jobs of tables and traces never arrived: their times are outside the shift." in log.page()
     assert "'jobs.csv': 2 of 5 times are outside the shift, which ends at horizon_s = 180" in caplog.text
-    assert "gives no job: its only time is outside" in faults_of(tmp_path, f"{SHORT}\na,hold,bench,,,180,,,,\n")
+    assert "gives no job: its only time is outside" in errors_of(tmp_path, f"{SHORT}\na,hold,bench,,,180,,,,\n")
 
 
-def test_faults_found_after_reading_name_file_row_and_column_all_at_once(tmp_path, plans):
+def test_errors_found_after_reading_name_file_row_and_column_all_at_once(tmp_path, plans):
     for name, rows in {
         "a.csv": ["x,hold,bench", "sort,hold,bench"],
         "b.csv": ["x,hold,bench", "y,hold,bench", "sort-001,hold,bench"],

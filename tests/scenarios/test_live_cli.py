@@ -382,7 +382,7 @@ def test_submitted_jobs_survive_a_kill(endpoint, tmp_path, thermofleet):
         table.write_text("name,kind,places\nc,hold,moon\n")
         code, out, err = thermofleet("job", "submit", table, *at)
         assert (code, out) == (2, "")
-        assert f"{table} has 1 fault:\n  row 2, column places: no place 'moon'. Allowed: " in err
+        assert f"{table} has 1 error:\n  row 2, column places: no place 'moon'. Allowed: " in err
         table.write_text("name,kind,places,after\na,hold,belt,\nd,hold,belt,\ne,hold,belt,no/one\n")
         code, out, _ = thermofleet("job", "submit", table, *at)
         assert (code, out.splitlines()) == (1, [

@@ -21,7 +21,7 @@ def own(tmp_path):
     file = tmp_path / "mine.py"
     file.write_text(
         "class Idle:\n scope = 'central'\n def reset(self, rng): ...\n def act(self, o): return dict.fromkeys(o, 0)\n"
-        "class Lone:\n scope = 'arm'\n def reset(self, rng): ...\n def choose(self, o, place): return place\n"
+        "class Lone:\n scope = 'arm'\n def reset(self, rng): ...\n def choose(self, o, arm_index): return arm_index\n"
         "class Old:\n def reset(self, rng): ...\n def act(self, o): return dict.fromkeys(o, 0)\n"
         "class No:\n scope = 'central'\n"
         "def make(): return Idle()\n"
@@ -54,7 +54,7 @@ def test_every_arm_has_an_instance_of_its_own(own):
         def reset(self, rng):
             """Nothing to reset."""
 
-        def choose(self, observation, place):
+        def choose(self, observation, arm_index):
             self.asked += 1
             return self.asked
 

@@ -444,7 +444,7 @@ def test_a_cooler_arm_at_work_is_named_with_the_end_of_its_job(end, told):
 def test_without_offers_only_the_work_is_told_and_without_a_fault_the_hottest_motor():
     assert sentences()[1:] == ("Why: at work without a pause since 0:00:00; no prediction was recorded.",)
     assert told({"metrics": {"peak_c": {"hot": 68.2, "cool": float("nan")}}}) == (
-        "No motor reached its fault limit; the hottest, in hot, reached 68 °C.",
+        "No motor reached its error limit; the hottest, in hot, reached 68 °C.",
     )
 
 

@@ -241,7 +241,7 @@ def test_all_jobs_of_a_large_fleet_are_told_and_counted():
         ("POST", "/v4/ask", {"jobs": []}, {}, 422, "length >= 1"),
         ("POST", "/v4/jobs", b" " * (MAX_BYTES + 1), {}, 413, "at most"),
         ("POST", "/v4/jobs", b" " * (MAX_TABLE_BYTES + 1), CSV, 413, "at most 1000000 bytes"),
-        ("POST", "/v4/jobs", b"", CSV, 422, "The table has 1 fault:\n  row 1: no column name and no column kind"),
+        ("POST", "/v4/jobs", b"", CSV, 422, "The table has 1 error:\n  row 1: no column name and no column kind"),
         ("POST", "/v4/jobs", b"\x00", CSV, 422, "The table is not a text file in UTF-8"),
         ("POST", "/v4/jobs", "a" + "," * 100, CSV, 422, "The table has 101 columns; a job table has at most 100"),
         ("POST", "/v4/jobs?shift_begin=6", b"", CSV, 422, "shift_begin must be a date with time and zone, as"),
@@ -308,7 +308,7 @@ def test_a_table_is_submitted_in_messages_or_all_its_faults_are_told(gateway, ar
     wrong = f"{head}\na;hold;moon;;;\nb;hold;mars;;;\n"
     status, kind, told = gateway.ask("POST", path, wrong, CSV)
     assert (status, kind, len(arm.requests)) == (422, "application/problem+json", before + 4)
-    assert "The table has 2 faults:\n  row 2, column places: no place 'moon'" in told["detail"]
+    assert "The table has 2 errors:\n  row 2, column places: no place 'moon'" in told["detail"]
     assert "row 3, column places: no place 'mars'" in told["detail"]
     status, _, told = gateway.ask("POST", path, f"{head}\na;hld;pallet;two;;\n", CSV)
     assert (status, told["detail"].count("row 2, column ")) == (422, 2)
