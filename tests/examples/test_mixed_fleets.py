@@ -98,7 +98,7 @@ def test_own_allocator_has_real_arms_do_the_jobs(bus, tmp_path):
     watcher.subscribe(keys.of_every_auction("f", "result"), Result, lambda _, result: statuses.append(result.status))
     watcher.subscribe(keys.of_every_arm("f", "state"), State, lambda _, state: None)
     with running("own_allocator", port, "f") as allocator, ExitStack() as stack:
-        for name in ("arm_0", "arm_1"):
+        for name in ("arm_2", "arm_3"):
             options = ["--difficulty", "blind", "--fleet", "f", "--endpoint", f"tcp/127.0.0.1:{port}"]
             command = commands.start(
                 "arm", "run", "quickstart", name, *options, "--journal", tmp_path / name, stderr=subprocess.DEVNULL
