@@ -352,6 +352,10 @@ def knowledge(folder: Path) -> str:
             for what, gain, p in zip(others.values(), gains, adjusted, strict=True)
         ]
         count += f" Where heat binds, without thermometers, errors of the twin {' and '.join(texts)}."
+    trainings = {name: found[name].card.trainings for name in found if found[name].card.trainings > 1}
+    if trainings:
+        listed = ", ".join(f"`{name}`" for name in trainings)
+        count += f" Mean of {min(trainings.values())} trainings of every arm's twin: {listed}."
     return table((*heads, "share, surprise", "faults"), rows) + f"\n\n{count}"
 
 
