@@ -589,7 +589,7 @@ def _has_all(reply: Status) -> bool:
 
 
 def _most_urgent(statuses: Sequence[JobStatus], most: int) -> tuple[JobStatus, ...]:
-    """Return the first `most` statuses in the order of `Status.jobs`; of those that have ended, the last is the newest."""
+    """Return the first `most` statuses in the order of `Status.jobs`; of the ended ones, the last is the newest."""
 
     def order(i: int) -> tuple[int, float, str]:
         status = statuses[i]
