@@ -83,7 +83,12 @@ class EventFeed:
         self._events.append(entry)
 
     def since(self, number: int) -> tuple[list[FeedEntry], bool]:
-        """Return the entries after a number, in order, and whether events between them were dropped."""
+        """Return the entries after a number, in order, and whether events between them were dropped.
+
+        Of a number that no entry has had yet nothing is known: all entries, and True.
+        """
+        if number > self._number:
+            return self.since(0)[0], True
         entries: list[FeedEntry] = []
         for kept in (self._newest.values(), self._events):
             entries += takewhile(lambda entry: entry.number > number, reversed(kept))

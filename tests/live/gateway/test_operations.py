@@ -147,8 +147,8 @@ def test_an_alarm_is_shown_acknowledged_and_published(gateway, arm, router):
 
         seen = wait_until(alarm)
         assert (seen["kind"], seen["by"], seen["ended_s"]) == ("unfinished", "", None)
-        for by, refused in (("", 422), (" ", 409)):
-            assert gateway.ask("POST", "/v4/alarms", {"alarm": seen["alarm"], "by": by})[0] == refused
+        for by in ("", " "):
+            assert gateway.ask("POST", "/v4/alarms", {"alarm": seen["alarm"], "by": by})[0] == 422
         assert gateway.ask("POST", "/v4/alarms", {"alarm": "none", "by": "ann"})[0] == 409
         status, _, seen_by = gateway.ask("POST", "/v4/alarms", {"alarm": seen["alarm"], "by": "ann"})
         assert (status, seen_by["by"]) == (200, "ann")
