@@ -98,7 +98,7 @@ class ControlRequest(msgspec.Struct, frozen=True):
 
     request: Annotated[str, msgspec.Meta(min_length=1, max_length=MAX_REQUEST_NAME)]
     """Unique name of this request, for example a UUID; the last 1024 are kept, across restarts. A repeated request gets
-    a reply and changes nothing; a different one of the same name is refused."""
+    a reply and changes nothing; one of the same name with another `action` or `by` is refused."""
     action: Action
     by: Person = ""
     """Who requests it, for journal, events and status."""
