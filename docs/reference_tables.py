@@ -16,6 +16,7 @@ from fleet.engine.batch import RewardWeights
 from fleet.events import MEANINGS
 from fleet.job import BOUNDS, LONGEST_GRASP_S, LONGEST_JOB_S
 from fleet.live.arm.awards import COMMIT_RETRY_S, RENEWALS, REPORT_RETRY_S, ExecutorConfig
+from fleet.live.arm.node import IDLE_PERIOD_S
 from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.job_rules import MAX_OPEN_JOBS
 from fleet.live.leases import Timing
@@ -155,7 +156,8 @@ def _time_table() -> str:
             "session lease: without messages for this long, Zenoh closes the session and withdraws its token",
         ),
         (f"{FRESH_S:g}", "all", "an arm whose last state is older is absent, even with a token"),
-        (f"{1.0 / (state.rate_hz or 1.0):g}", "arm", "between two `state` messages"),
+        (f"{1.0 / (state.rate_hz or 1.0):g}", "arm", "between two `state` messages, unless the arm is idle"),
+        (f"{IDLE_PERIOD_S:g}", "arm", "between two `state` messages of an idle arm"),
         (f"{state.heartbeat_s:g}", "all", "heartbeat: the last sequence number is repeated within this time"),
         (
             f"{timing.window_s:g}",

@@ -78,7 +78,7 @@ function show() {
   const counts = {};
   for (const state of jobs.values()) counts[state] = (counts[state] ?? 0) + 1;
   console.table(Object.fromEntries([...arms].sort()));
-  console.log("jobs:", counts);
+  console.log("jobs in the results received:", counts); // GET /v4/fleet has the counts of all jobs
 }
 
 const end = new AbortController();

@@ -155,11 +155,11 @@ def nearest(name: str, allowed: Iterable[str]) -> str:
 
 MAX_NAME = 128
 """Characters; a file name with it and an ending has at most 255 bytes."""
-_JOB_RULE, NAME_RULE = (
+JOB_RULE, NAME_RULE = (
     f"1 to {MAX_NAME} printable characters{without}, and no dot or space at the start"
     for without in ("", " without / \\ [ ]")
 )
-"""Rules for names of jobs, and of fleets, arms, auctioneers and places."""
+"""Rules for names of jobs and persons, and of fleets, arms, auctioneers and places."""
 _FORBIDDEN = frozenset("/\\[]")
 
 
@@ -180,7 +180,7 @@ def check_names(owner: object, *fields: str, of_jobs: bool = False) -> None:
         several = given if isinstance(given, tuple) else (given,)
         for name in chain.from_iterable((each,) if isinstance(each, str) else each for each in several):
             if not is_name(name, of_job=of_jobs):
-                rule = _JOB_RULE if of_jobs else NAME_RULE
+                rule = JOB_RULE if of_jobs else NAME_RULE
                 raise ValueError(f"{type(owner).__name__}.{field} must have {rule} (got '{printable(name)}').")
 
 

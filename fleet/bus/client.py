@@ -26,6 +26,7 @@ from fleet.bus.mailbox import Mailbox
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.keys import BusChannel, Pattern, channel_for, channel_of
 from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, check_name, decode, encode, encoding
+from fleet.bus.protocol.operator import check_request
 from fleet.bus.router import Connection
 from fleet.bus.security.access_control import RosterEntry, rights_by_role
 from fleet.bus.security.tls import check_listed, expires_at, is_past, participant_at
@@ -285,7 +286,8 @@ class BusClient(Connection):
             kind: Message type of the replies; one that names another sender than its key is malformed.
             timeout_s: Real seconds. A stopped process costs this long, unless `each` has enough replies before.
             each: Called with every reply as it arrives.
-            most: Replies that are read; the next one ends the query, with a reason in `refused`.
+            most: Replies that are read; the next one ends the query, with a reason in `refused`. So does a request that
+                is larger than a message, which is not sent.
 
         Raises:
             BusError: the client is not open, or its certificate does not allow the query: a router would drop it.
@@ -294,12 +296,16 @@ class BusClient(Connection):
         if channel.reply is not kind:
             raise ValueError(f"'{key}' is answered with {channel.reply}, not with {kind}.")
         self._check("query", key)
+        payload = encode(request)
+        if len(payload) > MOST_BYTES and channel.role != "policy":
+            self.post(done, Replies(refused={key: _too_large(len(payload))}, took_s=0.0))
+            return
         pending = _PendingQuery(self, kind, most, timeout_s, each, done)
         try:
             self._open().get(
                 key,
                 _direct(pending.receive, pending.finish),
-                payload=encode(request),
+                payload=payload,
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=timeout_s,
@@ -494,7 +500,7 @@ class BusClient(Connection):
         if (size := sum(len(part) for part in parts if part is not None)) <= MOST_BYTES:
             self.post(self._reply, key, query, kind, handle)
             return
-        refusal = Refusal(f"The request has {size:,} bytes, and at most {MOST_BYTES:,} are allowed.")
+        refusal = Refusal(_too_large(size))
         self.post(self.reject, f"query of '{key}'", refusal.reason)
         with query, suppress(ValueError):  # if there is no key to reply under
             query.reply(keys.answered(key, str(query.key_expr)), encode(refusal), encoding=encoding(Refusal))
@@ -513,6 +519,7 @@ class BusClient(Connection):
                 request = decode(kind, payload, "" if query.encoding is None else str(query.encoding))
                 if own_key != key:  # it ends in the name of the querier
                     check_name(request, keys.parse(own_key).asker, "arm")
+                check_request(request)
                 reply = handle(request)
             except MalformedMessage as error:
                 self.reject(f"query of '{own_key}'", error)
@@ -590,6 +597,10 @@ class _PendingQuery(Generic[Reply]):
         if self._arrived == 0 and self._replies.took_s >= self._timeout_s:  # a timeout of the router states none
             _add(self._replies.refused, "?", "")
         self._done(self._replies)
+
+
+def _too_large(size: int) -> str:
+    return f"The request has {size:,} bytes, and at most {MOST_BYTES:,} are allowed."
 
 
 def _add(table: dict[str, Entry], key: str, entry: Entry) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Set
 from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import SETTLED, JobStatus
+from fleet.bus.protocol.messages import encode
 from fleet.bus.protocol.operator import (
     ALL_ARMS,
     Cancel,
@@ -49,14 +50,15 @@ def carry_out(book: JobBook, request: ControlRequest, arms: Set[str], time_s: fl
     if (known := book.operations.names.get(request.request)) is not None:
         if known != content_hash(request):
             raise Refused(
-                f"Another request of the name '{request.request}' was carried out before, so this one is not "
-                f"({request.action}). Give each request a name of its own, for example a UUID."
+                f"Another request of the name '{request.request}' was carried out before, so this one is not: its "
+                f"action or `by` differs (got {encode(request).decode()}). Give each request a name of its own, for "
+                "example a UUID."
             )
         return None, ALREADY_DONE
     note = objection(book, request, arms)
     operation = replace(operation_of(book, request, time_s), note=note)
     book.record(*progress(book, [requested_job(request)]), Requested(operation))
-    _LOG.warning("'%s' requested: %s", request.by, request.action)
+    _LOG.warning("'%s' requested: %s", request.by, encode(request.action).decode())
     return operation, note
 
 

@@ -13,7 +13,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Clock, ClockRequest
 from fleet.bus.router import fleets_at, other_versions
 from fleet.bus.security.tls import identified, why_not
-from fleet.errors import BusError
+from fleet.errors import BusError, visible
 from fleet.live.monitor.health import MOST_REASONS, ClockProbe, HealthReport, check_health
 from fleet.live.monitor.snapshot import FleetListener, FleetSnapshot
 from scenarios.show.watch import arm_table, jobs_line, space_line
@@ -131,9 +131,8 @@ def show(endpoint: str, fleet: FleetSnapshot, report: HealthReport) -> None:
         shown[finding.kind] += bool(finding.kind)
         if shown[finding.kind] > MOST_REASONS:
             continue
-        out_console.print(
-            f"{finding.level}: {finding.what}", style=_COLORS.get(finding.level, ""), highlight=False, markup=False
-        )
+        line = f"{finding.level}: {visible(finding.what)}"
+        out_console.print(line, style=_COLORS.get(finding.level, ""), highlight=False, markup=False)
     for kind, count in shown.items():
         if count > MOST_REASONS:
             say(f"… and {count - MOST_REASONS} more of the kind {kind}; --json has all.", out_console)

@@ -9,6 +9,7 @@ import asyncio
 import gzip
 import hmac
 import ipaddress
+import json
 import logging
 import math
 import os
@@ -44,7 +45,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import JobSpec, QuoteRequest, Submission, SubmissionReply
+from fleet.bus.protocol.auction import JobSpec, QuoteRequest, StatusRequest, Submission, SubmissionReply
 from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.messages import MalformedMessage, decode, encode
 from fleet.bus.protocol.operator import (
@@ -56,11 +57,23 @@ from fleet.bus.protocol.operator import (
     Person,
     ResetReply,
     ResetRequest,
+    check_request,
 )
 from fleet.bus.security.access_control import RosterEntry, rights_by_role
 from fleet.bus.security.tls import participant_at
 from fleet.env.render.heat import heat_scale
-from fleet.errors import NAME_RULE, BusError, FleetError, Refused, ScenarioError, is_name, listed, nearest
+from fleet.errors import (
+    JOB_RULE,
+    NAME_RULE,
+    BusError,
+    FleetError,
+    Refused,
+    ScenarioError,
+    is_name,
+    listed,
+    nearest,
+    printable,
+)
 from fleet.live.job_client import batches
 from fleet.live.monitor.async_bridge import MONITOR, AsyncBridge, EventFeed, FeedEntry
 from fleet.live.monitor.health import Finding
@@ -115,11 +128,10 @@ TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
     "img-src 'self' data: blob:; form-action 'none'; base-uri 'none'; frame-ancestors 'none'",
-    "Content-Encoding": "gzip",
     "Cache-Control": "no-cache",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Referrer-Policy": "no-referrer",
-    "Vary": "Accept",
+    "Vary": "Accept, Accept-Encoding",
     "X-Content-Type-Options": "nosniff",
 }
 
@@ -141,12 +153,14 @@ class LivePage:
 
     async def file(self, request: Request) -> Response:
         """A file of the page."""
-        return self.response(str(request.url.path).removeprefix("/page/"))
+        return self.response(request, str(request.url.path).removeprefix("/page/"))
 
-    def response(self, name: str = PAGE) -> Response:
-        """The page, or one of its files."""
+    def response(self, request: Request, name: str = PAGE) -> Response:
+        """The page, or one of its files; compressed if the request accepts that."""
         kind = f"{TYPES[name.rpartition('.')[2]]}; charset=utf-8"
-        return Response(self.contents[name], media_type=kind, headers=HEADERS)
+        if "gzip" in request.headers.get("accept-encoding", ""):
+            return Response(self.contents[name], media_type=kind, headers={**HEADERS, "Content-Encoding": "gzip"})
+        return Response(gzip.decompress(self.contents[name]), media_type=kind, headers=HEADERS)
 
     @cached_property
     def contents(self) -> Mapping[str, bytes]:
@@ -244,8 +258,10 @@ class AccessCheck:
         """Refuse the request or pass it on, with its role."""
         refusal = None
         if scope["type"] == "http":
-            headers = dict(scope["headers"])
-            refusal = None if self.tokens and self.page and is_public(scope) else self.refusal(headers)
+            headers, public = dict(scope["headers"]), self.page and is_public(scope)
+            refusal = None if self.tokens and public else self.refusal(headers)
+            if refusal is None and not public:  # a link to the page may be anywhere
+                refusal = refuse_origin(headers)
             if refusal is None:
                 shown = headers.get(b"authorization", b"")[7:]
                 scope["role"] = self.tokens.get(shown, "monitor" if self.tokens else "operator")
@@ -256,8 +272,7 @@ class AccessCheck:
     def refusal(self, headers: dict[bytes, bytes]) -> Response | None:
         """Error response, None if the request may pass."""
         if not self.tokens:
-            host = headers.get(b"host", b"").decode("latin-1")
-            name = host if host.endswith("]") else host.rpartition(":")[0] or host
+            name = host_name(headers.get(b"host", b"").decode("latin-1"))
             if name in LOCAL:
                 return None
             return problem_response(HTTPStatus.MISDIRECTED_REQUEST, f"This gateway is {LOCAL[0]}, not '{name}'.")
@@ -278,6 +293,25 @@ class AccessCheck:
             return None
         detail = f"More than {RATE_HZ:g} requests a second."
         return problem_response(HTTPStatus.TOO_MANY_REQUESTS, detail, {"Retry-After": str(math.ceil(1 / RATE_HZ))})
+
+
+def host_name(host: str) -> str:
+    """The name in `NAME:PORT`, or in `NAME`."""
+    return host if host.endswith("]") else host.rpartition(":")[0] or host
+
+
+def refuse_origin(headers: Mapping[bytes, bytes]) -> Response | None:
+    """Error response to a request of a web page of another host; None for programs and for the page of this host.
+
+    A proxy may change the host of a request: what the browser itself states in `Sec-Fetch-Site` comes first.
+    """
+    host, origin, site = (headers.get(name, b"").decode("latin-1") for name in (b"host", b"origin", b"sec-fetch-site"))
+    name = host_name(origin.partition("://")[2])  # "" of the origin null
+    is_own = site == "same-origin" or not origin or (bool(name) and name in (host_name(host), *LOCAL))
+    if site != "cross-site" and is_own:
+        return None
+    given = printable(origin) if origin else f"Sec-Fetch-Site: {site}"
+    return problem_response(HTTPStatus.FORBIDDEN, f"Web pages of other hosts may send no requests (got '{given}').")
 
 
 def problem_response(status: HTTPStatus, detail: str, headers: Mapping[str, str] | None = None) -> Response:
@@ -372,11 +406,16 @@ def application(
     submit_json = of_jobs("submit", Submission, SubmissionReply)
 
     async def submit(request: Request) -> Response:
-        return await (submit_table if content_type(request) == TABLE else submit_json)(request)
+        if content_type(request) == TABLE:
+            return await submit_table(request)
+        if request.query_params:
+            raise MalformedMessage(f"Parameters are for a table ({TABLE}); a Submission has the field `by`.")
+        return await submit_json(request)
 
     async def submit_table(request: Request) -> Response:
         content = await read_bytes(request, MAX_TABLE_BYTES)
         begin, by = (request.query_params.get(key, "") for key in ("shift_begin", "by"))
+        check_request(Submission((), by))
         places, reply = None, SubmissionReply("", ())
         with suppress(Refused, BusError):  # no participant knows the cell
             places = [place.name for place in (await ask_cell()).places]
@@ -391,13 +430,19 @@ def application(
             accepted = ", ".join(rows[each.job][0] for each in reply.jobs if each.accepted)
             kind = type(error) if isinstance(error, Refused) else BusError
             raise kind(f"{error} Accepted before: {accepted or 'no job'}.") from error
-        return json_response(reply)
+        order = {name: number for number, name in enumerate(rows)}
+        return json_response(replace(reply, jobs=tuple(sorted(reply.jobs, key=lambda each: order[each.job]))))
 
     control = of_jobs("control", ControlRequest, Controlled)
     clear = of_jobs("clear", ClearRequest, Cleared)
 
     async def get_jobs(request: Request) -> Response:
         names = request.query_params.getlist("job")
+        if wrong := [name for name in names if not is_name(name, of_job=True)]:
+            raise MalformedMessage(f"?job=NAME must have {JOB_RULE} (got '{printable(wrong[0])}').")
+        if (size := len(encode(StatusRequest(tuple(names))))) > MAX_BYTES:
+            given = f"The names of {len(names)} jobs have {size:,} bytes, and at most {MAX_BYTES:,} are allowed."
+            raise MalformedMessage(f"{given} Ask for fewer jobs at a time, or for all, without a name.")
         return json_response(await limited(lambda: bridge.statuses(names)))
 
     async def post_reset(request: Request) -> Response:
@@ -444,7 +489,7 @@ def application(
 
     async def contents(request: Request) -> Response:
         if page is not None and wants_page(request.scope):
-            return page.response()
+            return page.response(request)
         entries = [{"method": m, "path": p, "role": role, "what": what} for m, p, role, _, what in table]
         return json_response({"gateway": "thermofleet", "role": request.scope["role"], "requests": entries})
 
@@ -553,13 +598,33 @@ async def read_body(request: Request, kind: type[Body]) -> Body:
     """Read the message that is the body of a request.
 
     Raises:
-        HTTPException: not JSON, too large or too slow.
+        HTTPException: not JSON in UTF-8, compressed, too large or too slow, or a field occurs twice.
         MalformedMessage: not a message of this kind.
     """
     if (given := content_type(request)) != "application/json":
         detail = f"The body must be application/json, or for /v4/jobs also {TABLE} (got '{given}')."
         raise HTTPException(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, detail)
-    return decode(kind, await read_bytes(request, MAX_BYTES))
+    _, _, charset = request.headers["content-type"].lower().partition("charset=")
+    charset = charset.partition(";")[0].strip(' "')
+    if charset not in ("", "utf-8", "utf8"):
+        detail = f"JSON must be UTF-8 (got charset '{printable(charset)}')."
+        raise HTTPException(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, detail)
+    content = await read_bytes(request, MAX_BYTES)
+    message = decode(kind, content)
+    check_request(message)
+    try:
+        json.loads(content, object_pairs_hook=_check_fields, parse_int=str)  # `decode` takes the last of equal fields
+    except (ValueError, RecursionError) as error:  # in fields that `decode` ignores
+        raise MalformedMessage(f"Not JSON: {error}.") from error
+    return message
+
+
+def _check_fields(fields: Sequence[tuple[str, object]]) -> None:
+    """Raise an HTTPException if an object has a field twice."""
+    counts = Counter(name for name, _ in fields)
+    if twice := [name for name, count in counts.items() if count > 1]:
+        detail = f"An object has the field '{printable(twice[0])}' twice."
+        raise HTTPException(HTTPStatus.UNPROCESSABLE_ENTITY, detail)
 
 
 def content_type(request: Request) -> str:
@@ -568,7 +633,10 @@ def content_type(request: Request) -> str:
 
 
 async def read_bytes(request: Request, most: int) -> bytes:
-    """Read a body of at most `most` bytes; raises an HTTPException if it is too large or too slow."""
+    """Read a body of at most `most` bytes; raises an HTTPException if it is compressed, too large or too slow."""
+    if (coding := request.headers.get("content-encoding", "identity").lower()) != "identity":
+        detail = f"The body must not be compressed (got Content-Encoding '{printable(coding)}')."
+        raise HTTPException(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, detail)
     content = bytearray()
     try:
         async with asyncio.timeout(BODY_S):

@@ -39,7 +39,7 @@ from fleet.bus.protocol.operator import (
     Resume,
 )
 from fleet.bus.security.tls import unknown_certificate_hint
-from fleet.errors import BusError, FleetError, Refused, nearest
+from fleet.errors import JOB_RULE, BusError, FleetError, Refused, is_name, nearest, printable, visible
 from fleet.job import BOUNDS, KINDS
 from fleet.live.job_client import JobClient
 from fleet.live.monitor.snapshot import describe_status
@@ -55,8 +55,6 @@ TURN_S = 0.2
 """Real seconds between two checks for a stop request, and before a request for quotes is repeated."""
 PATIENCE_S = 30.0
 """Real seconds without a reply after which following ends."""
-MOST_CHARACTERS = 128
-"""Longest name of a person."""
 _NEEDS_ROLE = (
     "With TLS, use a certificate of the role operator that the router knows: it reads its roster when it starts."
 )
@@ -287,7 +285,7 @@ def control(actions: Sequence[Action], by: str, endpoint: str, fleet: str) -> No
                 raise BusError(
                     f"No auctioneer or arm of fleet '{link.fleet}' replied within {wait_s}. {_NEEDS_ROLE}"
                 ) from error
-            echo(_describe(action, reply))
+            echo(visible(_describe(action, reply)))
 
 
 def _describe(action: Action, reply: Controlled) -> str:
@@ -339,10 +337,10 @@ def _person(by: str) -> str:
     """Name of the requester: the given one, or the user of this process, "" if it has no name.
 
     Raises:
-        FleetError: it is too long.
+        FleetError: it is no name.
     """
-    if len(by) > MOST_CHARACTERS:
-        raise FleetError(f"--by must have at most {MOST_CHARACTERS} characters (got {len(by)}).")
+    if by and not is_name(by, of_job=True):
+        raise FleetError(f"--by must have {JOB_RULE} (got '{printable(by)}').")
     try:
         return by or getpass.getuser()
     except (KeyError, OSError):

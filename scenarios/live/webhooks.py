@@ -20,14 +20,15 @@ from fleet.bus.protocol.messages import encode
 from fleet.bus.protocol.operator import Alarm
 from fleet.errors import FleetError, printable
 from fleet.live.monitor.health import Finding
+from fleet.live.monitor.snapshot import MAX_ALARMS
 
 _LOG = logging.getLogger(__name__)
 
 SECRET = "THERMOFLEET_WEBHOOK_SECRET"
 """Environment variable of the secret."""
 MIN_SECRET = 16
-MOST_WAITING = 256
-"""Alarms that wait for one target; the next one drops the oldest."""
+MOST_WAITING = 2 * MAX_ALARMS
+"""Alarms that wait for one target; the next one drops the oldest. At its start a gateway sends all that it knows."""
 REPLY_S = 5.0
 """Real seconds for a whole request."""
 RETRY_S = (1.0, 5.0, 30.0, 120.0)

@@ -18,7 +18,7 @@ from fleet.bus.client import BusClient
 from fleet.bus.protocol.auction import SETTLED, ArmEvent, JobState, Result
 from fleet.bus.protocol.operator import Alarm
 from fleet.bus.router import fleets_at
-from fleet.errors import NoRouter
+from fleet.errors import NoRouter, visible
 from fleet.live.monitor.health import check_pauses
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetListener, FleetSnapshot, JobScore, describe_status
 from fleet.live.space import ANYWHERE
@@ -65,7 +65,7 @@ def watch(
     news: deque[str] = deque(maxlen=100)
 
     def on_message(_: str, name: str, message: msgspec.Struct) -> None:
-        if line := describe(name, message):
+        if line := visible(describe(name, message)):
             news.append(line)
 
     def on_presence(role: str, name: str, present: bool) -> None:
@@ -224,7 +224,8 @@ def screen(
 
 def _line(*parts: str | tuple[str, str]) -> Text:
     """One line of texts, some with a style; its end is cut off on a narrow terminal."""
-    return Text.assemble(*parts, no_wrap=True, overflow="ellipsis")
+    shown = (visible(part) if isinstance(part, str) else (visible(part[0]), part[1]) for part in parts)
+    return Text.assemble(*shown, no_wrap=True, overflow="ellipsis")
 
 
 def heading(fleet: FleetSnapshot) -> Text:

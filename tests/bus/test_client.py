@@ -14,8 +14,19 @@ import pytest
 from fleet.bus.client import MOST_REJECTIONS, MOST_REPLIES, BusClient, Refused, _PendingQuery, under
 from fleet.bus.mailbox import Mailbox
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import Admission, ArmEvent, Clock, ClockRequest, JobSpec, Submission, SubmissionReply
+from fleet.bus.protocol.auction import (
+    Admission,
+    ArmEvent,
+    Clock,
+    ClockRequest,
+    JobSpec,
+    Status,
+    StatusRequest,
+    Submission,
+    SubmissionReply,
+)
 from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, State, decode, encode, encoding
+from fleet.bus.protocol.operator import ResetReply, ResetRequest
 from fleet.bus.router import Router
 from fleet.errors import BusError
 from fleet.live.supervisor import Supervisor
@@ -162,6 +173,25 @@ def test_a_large_question_is_refused_before_it_waits(bus, part):
     )
     teller.serve()
     assert (teller.malformed, asked) == (1, [])
+
+
+def test_a_request_larger_than_a_message_is_refused_where_it_is_sent(bus):
+    with pytest.raises(Refused, match=r"The request has 65,5\d\d bytes, and at most 65,536 are allowed"):
+        bus().ask(keys.of_jobs("f", "status"), StatusRequest(("x" * MOST_BYTES,)), Status, timeout_s=PATIENCE_S)
+
+
+def test_a_request_of_a_person_without_a_printable_name_is_refused(bus):
+    asker, teller, requests = bus(), bus(), []
+    key = keys.of_arm("f", "a", "reset")
+    teller.reply_to(key, ResetRequest, lambda request: requests.append(request) or ResetReply("a", True))
+    meet(asker, teller)
+    got = []
+    for by in ("ann\nfault: arm_0", ""):
+        asker.query(key, ResetRequest(by), ResetReply, got.append, timeout_s=PATIENCE_S)
+    serve_until(lambda: len(got) == 2, asker, teller)
+    refused = next(replies for replies in got if replies.refusals)
+    assert refused.refusals[0].startswith("ResetRequest.by must have 1 to 128 printable characters")
+    assert requests == [ResetRequest("")]
 
 
 @pytest.mark.parametrize("most", [2, MOST_REPLIES])

@@ -20,6 +20,7 @@ from fleet.bus.protocol.operator import Alarm
 from fleet.bus.router import Router
 from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_arm, check_fleet, check_health, check_progress
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, AuctioneerSnapshot, FleetSnapshot, FleetView
+from scenarios.live.doctor import show
 from scenarios.show.watch import space_line
 from tests import commands
 from tests.waiting import serving
@@ -310,6 +311,12 @@ def test_a_job_of_unknown_outcome_is_a_fault_but_for_the_end_of_the_shift(ended,
     output, found = faults(msgspec.structs.replace(fleet(arm()), jobs=jobs))
     assert output == ["'x' is unfinished, so its outcome is unknown: no reason"] * (not healthy)
     assert found.healthy == healthy
+
+
+def test_text_of_others_forges_no_line_of_the_report(capsys):
+    paused = msgspec.structs.replace(fleet(arm()), paused={"a": "ann'.\nfault: 'b"})
+    show("tcp/127.0.0.1:1", paused, check_health(paused, 106.5, [ASKED]))
+    assert "note: a is paused by 'ann'.\\nfault: 'b'." in capsys.readouterr().out
 
 
 def test_a_warning_is_no_fault():

@@ -216,6 +216,11 @@ def test_the_name_of_a_request_stands_for_one_request(fleet, restarts):
     assert (same.changed, same.note, same.job.state) == (False, "This request was carried out before.", "cancelled")
     for other in (Cancel("b"), Change("a", value=2.0), Pause()):
         assert "Another request of the name 'one'" in refused(lambda other=other: fleet.control(other, "one"))
+    why = refused(lambda: fleet.control(Cancel("a"), "one", by="bob"))
+    assert (
+        """its action or `by` differs (got {"request":"one","action":{"action":"cancel","job":"a"},"by":"bob"})"""
+        in why
+    )
     assert fleet.status("b").state == "waiting"
     assert fleet.control(Cancel("b"), "two").changed
 

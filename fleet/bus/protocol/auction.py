@@ -128,7 +128,8 @@ class Admission(msgspec.Struct, frozen=True):
     accepted: bool
     """Also true for an identical job that was accepted before."""
     reason: str = ""
-    """Why it is not accepted, or is `given_up` at once."""
+    """Why it is not accepted. Of an accepted job: why it is `given_up` at once, or that it has ended already; otherwise
+    ""."""
 
 
 class SubmissionReply(msgspec.Struct, frozen=True):
@@ -172,8 +173,8 @@ class PlanQuote(FiniteStruct, frozen=True, omit_defaults=True):
     finish_in_s: Duration | None = None
     """Time until its last cycle would be done, after the arm's current jobs; without the way home."""
     space: Name | None = None
-    """Name of the space of its plan, from home to home, or a sphere that it does not leave, in the frame of the cell, as
-    `sphere:1.5,0,0.4,0.8` (X, Y, Z, radius, m); null for unknown: its whole workspace counts as taken."""
+    """Name of the space of its plan, from home to home, or a sphere that it does not leave, in the frame of the cell,
+    as `sphere:1.5,0,0.4,0.8` (X, Y, Z, radius, m); null for unknown: its whole workspace counts as taken."""
 
 
 class JobEstimate(msgspec.Struct, frozen=True, omit_defaults=True):

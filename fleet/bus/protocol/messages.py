@@ -25,7 +25,7 @@ LISTED_BYTES = 60_000
 """Size to which a list in a message is cut, below `MOST_BYTES`."""
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=512)]
 Person = Annotated[str, msgspec.Meta(max_length=128)]
-"""Who requests something."""
+"""Who requests something: "", or a name as of a job."""
 LEAST, MOST, MOST_COUNT = -1e12, 1e12, 10**15
 Count = Annotated[int, msgspec.Meta(ge=0, le=MOST_COUNT)]
 Number = Annotated[float, msgspec.Meta(ge=LEAST, le=MOST)]

@@ -5,7 +5,9 @@ from typing import Annotated, Literal
 import msgspec
 
 from fleet.bus.protocol.auction import JobStatus
-from fleet.bus.protocol.messages import Count, FiniteStruct, Name, Number, Person
+from fleet.bus.protocol.messages import Count, FiniteStruct, MalformedMessage, Name, Number, Person
+from fleet.errors import check_names
+from fleet.job import check_bounds
 
 MAX_REQUEST_NAME = 64
 """Characters of the name of a request."""
@@ -96,7 +98,7 @@ class ControlRequest(msgspec.Struct, frozen=True):
 
     request: Annotated[str, msgspec.Meta(min_length=1, max_length=MAX_REQUEST_NAME)]
     """Unique name of this request, for example a UUID; the last 1024 are kept, across restarts. A repeated request gets
-    a reply and changes nothing; a different one of the same name is refused."""
+    a reply and changes nothing; one of the same name with another `action` or `by` is refused."""
     action: Action
     by: Person = ""
     """Who requests it, for journal, events and status."""
@@ -115,6 +117,25 @@ class Controlled(msgspec.Struct, frozen=True):
     """The job now; null for a pause, and for a settled job that was evicted."""
     paused: dict[Name, str] = {}
     """As in `Status`."""
+
+
+def check_request(request: msgspec.Struct) -> None:
+    """Check who makes a new request, and the values of a change.
+
+    Messages in journals and recordings are not checked: an earlier version may have accepted them.
+
+    Raises:
+        MalformedMessage: names the field, the value and the rule.
+    """
+    action = getattr(request, "action", None)
+    try:
+        if getattr(request, "by", ""):
+            check_names(request, "by", of_jobs=True)
+        if isinstance(action, Change):
+            given = (name for name in ("due_s", "value") if getattr(action, name) is not msgspec.UNSET)
+            check_bounds(action, *given)
+    except ValueError as error:
+        raise MalformedMessage(str(error)) from error
 
 
 class ResetRequest(msgspec.Struct, frozen=True):

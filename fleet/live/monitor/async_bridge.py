@@ -83,7 +83,12 @@ class EventFeed:
         self._events.append(entry)
 
     def since(self, number: int) -> tuple[list[FeedEntry], bool]:
-        """Return the entries after a number, in order, and whether events between them were dropped."""
+        """Return the entries after a number, in order, and whether events between them were dropped.
+
+        Of a number that no entry has had yet nothing is known: all entries, and True.
+        """
+        if number > self._number:
+            return self.since(0)[0], True
         entries: list[FeedEntry] = []
         for kept in (self._newest.values(), self._events):
             entries += takewhile(lambda entry: entry.number > number, reversed(kept))
@@ -122,7 +127,8 @@ class AsyncBridge:
             on_message: Called for every message in `feed`, on the event loop.
             monitor: Name under which alarms are published if `link` has no certificate, whose name is used.
             kept: Alarms of a recording, which are published again.
-            on_alarm: Called for every change of an alarm by any monitor, on the event loop.
+            on_alarm: Called on the event loop: at the first check for every known alarm, then for every change of an
+                alarm by any monitor. A receiver thereby learns what changed while this monitor did not run.
             more_findings: Findings beside those of the fleet, which raise alarms too; called on the thread of the bus.
         """
         self.feed = EventFeed()
@@ -146,7 +152,8 @@ class AsyncBridge:
         self._earlier = deque[FleetSnapshot](maxlen=3)
         self._known: list[Finding] = []
         """Findings of the last check with a connection to the router."""
-        self._told = {each.alarm: (each.ended_s is None, each.by) for each in self._alarms.alarms.values()}
+        self._told: dict[str, tuple[bool, str]] = {}
+        """Whether each alarm lasts and who has acknowledged it, as `on_alarm` was last called."""
         for alarm in self._alarms.alarms.values():
             self._publish(alarm)
 
@@ -260,7 +267,7 @@ class AsyncBridge:
         alarms = self._alarms.alarms
         told, self._told = self._told, {name: (each.ended_s is None, each.by) for name, each in alarms.items()}
         for name, state in self._told.items():
-            if state != told.get(name, state if alarms[name].ended_s is not None else None):
+            if state != told.get(name):
                 self._on_loop(partial(self._on_alarm, alarms[name]))
 
     def _message(self, topic: str, name: str, message: msgspec.Struct) -> None:

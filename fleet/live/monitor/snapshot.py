@@ -173,7 +173,8 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
     counts: dict[str, int]
     """Number of all jobs by state."""
     jobs: tuple[JobStatus, ...]
-    """At most `MAX_JOBS`, the most recently changed last. Of more, those that have ended are dropped first."""
+    """At most `MAX_JOBS`, in the order of `Status.jobs`: of ended jobs the newest first. Of more, the oldest of those
+    that have ended are dropped first."""
     space: dict[str, tuple[str, ...]] = {}
     """Names of the spaces that are closed to other arms, by arm, from the last status reply."""
     paused: dict[str, str] = {}
@@ -348,7 +349,7 @@ class FleetView:
                 job.number = 0
         auctioneer.heard_s, auctioneer.time_s, auctioneer.trouble = now_s, reply.time_s, reply.trouble
         self._space, self._paused, self._left_out = dict(reply.space), dict(reply.paused), dict(reply.left_out)
-        for status in reversed(reply.jobs):  # so that those that need a person count as the most recent ones
+        for status in reversed(reply.jobs):  # the newest of those that have ended come first in a reply
             self._set_status(status, now_s)
 
     def forget_other_jobs(self, replies: Sequence[Status], asked_s: float) -> None:
@@ -374,8 +375,8 @@ class FleetView:
     def snapshot(self, now_s: float, jobs: int = MAX_JOBS) -> FleetSnapshot:
         """The fleet at the real second `now_s`, with at most `jobs` jobs.
 
-        Of more jobs it has those that need a person, then those in work, those that wait, and the others; of these
-        those that changed last.
+        They are those that need a person, then those in work, those that wait, by release, and the others, of which
+        those that ended last come first.
         """
         statuses = [job.status for job in self._jobs.values()]
         ended = {status.job for status in statuses if status.state in ("finished", "unfinished")}
@@ -431,6 +432,8 @@ class FleetView:
         # A result has neither a predicted end nor why a job waits: it replaces a status that it changes.
         if job is None or (job.status != status if number is None else _progress(job.status) != _progress(status)):
             job = self._jobs[status.job] = _Job(status, now_s)
+        elif number is None:
+            self._jobs.move_to_end(status.job)
         job.heard_s, job.number = now_s, max(last, number or 0)
 
 
@@ -586,14 +589,14 @@ def _has_all(reply: Status) -> bool:
 
 
 def _most_urgent(statuses: Sequence[JobStatus], most: int) -> tuple[JobStatus, ...]:
-    """Return at most `most` statuses in their order: the most urgent, and of equally urgent ones the last."""
+    """Return the first `most` statuses in the order of `Status.jobs`; of the ended ones, the last is the newest."""
 
-    def order(i: int) -> tuple[int, int]:
-        return urgency(statuses[i].state, shift_ended=statuses[i].shift_ended), -i
+    def order(i: int) -> tuple[int, float, str]:
+        status = statuses[i]
+        group = urgency(status.state, shift_ended=status.shift_ended)
+        return (group, -i, "") if status.state in ENDED else (group, status.release_s or 0.0, status.job)
 
-    if len(statuses) <= most:
-        return tuple(statuses)
-    return tuple(statuses[i] for i in sorted(sorted(range(len(statuses)), key=order)[:most]))
+    return tuple(statuses[i] for i in sorted(range(len(statuses)), key=order)[:most])
 
 
 def _arm_snapshot(name: str, arm: _Arm, now_s: float, speed: float | None, ended: Container[str]) -> ArmSnapshot:

@@ -78,7 +78,7 @@ function startPage() {
   function setJob(status, result) {
     const before = fleet.jobs.get(status.job);
     fleet.jobs.set(status.job, status);
-    if (fleet.jobs.size > 4 * MOST_JOBS) fleet.jobs.delete(fleet.jobs.keys().next().value);
+    if (fleet.jobs.size > 8 * MOST_JOBS) fleet.jobs.delete(fleet.jobs.keys().next().value);
     if (status.state === "awarded" && status.arm && (!before || before.arm !== status.arm || before.state !== "awarded")) {
       const all = new Map(offers.get(status.job));
       for (const { arm, plan } of (result && result.offers) || [])
@@ -207,9 +207,8 @@ function startPage() {
       if (one.state_age_s !== null) arm.atMs = Math.max(arm.atMs, nowMs - 1000 * one.state_age_s);
       arm.difficultyMs = one.difficulty_age_s === null ? null : nowMs - 1000 * one.difficulty_age_s;
     }
-    const named = new Set(snapshot.jobs.map(({ job }) => job));
-    for (const job of [...fleet.jobs.keys()]) if (!named.has(job)) fleet.jobs.delete(job);
     for (const status of snapshot.jobs) setJob(status);
+    fleet.jobs = new Map(snapshot.jobs.map((status) => [status.job, status])); // of those that have ended, the newest first
     for (const { alarm, what, by, time_s: timeS, began_s: beganS, ended_s: endedS } of snapshot.alarms) {
       const began = `alarm/${alarm}/began`, seen = `alarm/${alarm}/seen`, ended = `alarm/${alarm}/ended`;
       note(began, beganS, `Alarm: ${what}`, "fault");
@@ -370,7 +369,7 @@ function startPage() {
     const counts = Object.entries(fleet.counts).filter(([, count]) => count > 0), openCount = counts.reduce((sum, [state, count]) => sum + (state in rank ? count : 0), 0);
     const counted = counts.map(([state, count]) => `${count} ${state.replace("_", " ")}`).join(", ");
     setText(element("counts"), `${counted || "No jobs"}.${openCount > MOST_ROWS ? ` The first ${MOST_ROWS} of ${openCount} open jobs are listed.` : ""}`);
-    if (element("settled-part").open) settled.update(listed.filter(({ state }) => !(state in rank)).reverse().slice(0, MOST_ROWS).map((status) => [status.job, status]), fillSettled);
+    if (element("settled-part").open) settled.update(listed.filter(({ state }) => !(state in rank)).slice(0, MOST_ROWS).map((status) => [status.job, status]), fillSettled);
     const waiting = open.filter(({ job, state }) => state === "waiting" && (offers.get(job) || new Map()).size).slice(0, MOST_AWARDS);
     offered.update([
       ...waiting.map(({ job }) => [`waiting/${job}`, { job, state: "… waiting", winner: "", scores: offers.get(job) }]),

@@ -33,6 +33,9 @@ from tests.waiting import PATIENCE_S, serving, wait_until
 
 BROWSER = {"Accept": "text/html,application/xhtml+xml,application/xml;q=0.9,*/*;q=0.8"}
 CRATE_JSON = {"name": "crate 1", "kind": "hold", "places": ["rack"]}
+JSON = "application/json"
+PAUSE = {"request": "1", "action": {"action": "pause"}}
+LATE = {"action": "change", "job": "a", "due_s": -5}
 CSV = {"Content-Type": "text/csv; charset=utf-8"}
 WATCHER, SENDER, BOSS = "watcher-watcher-watcher", "sender-sender-sender", "operator-operator-operator"
 
@@ -266,6 +269,58 @@ def test_all_jobs_of_a_large_fleet_are_told_and_counted():
             422,
             "`. Allowed: done, redo",
         ),
+        (
+            "POST",
+            "/v4/jobs",
+            {"jobs": [CRATE_JSON], "by": "a\nb"},
+            {},
+            422,
+            "Submission.by must have 1 to 128 printable",
+        ),
+        ("POST", "/v4/jobs?by=%1b", b"name,kind,places\na,hold,pallet", CSV, 422, "Submission.by must have 1 to 128"),
+        ("POST", "/v4/control", {**PAUSE, "by": "\u202ea"}, {}, 422, "ControlRequest.by must have 1 to 128 printable"),
+        ("POST", "/v4/clear", {"arm": "a+1", "by": ".a"}, {}, 422, "ClearRequest.by must have 1 to 128 printable"),
+        ("POST", "/v4/reset", {"arm": "a+1", "by": "\r"}, {}, 422, "ResetBody.by must have 1 to 128 printable"),
+        ("POST", "/v4/alarms", {"alarm": "a", "by": "\r"}, {}, 422, "AcknowledgeBody.by must have 1 to 128 printable"),
+        ("POST", "/v4/control", {**PAUSE, "action": LATE}, {}, 422, "Change.due_s must be between 0 and"),
+        ("POST", "/v4/alarms", '{"alarm": "a", "by": "b", "by": "c"}', {}, 422, "An object has the field 'by' twice."),
+        ("POST", "/v4/alarms", b'{"alarm": "a", "by": "b", "x": "\xff"}', {}, 422, "Not"),
+        ("POST", "/v4/jobs?by=erp", {"jobs": [CRATE_JSON]}, {}, 422, "Parameters are for a table (text/csv);"),
+        ("POST", "/v4/ask", {"jobs": [CRATE_JSON]}, {"Content-Type": JSON + "; charset=latin-1"}, 415, "be UTF-8"),
+        (
+            "POST",
+            "/v4/ask",
+            b"x",
+            {"Content-Encoding": "gzip"},
+            415,
+            "must not be compressed (got Content-Encoding 'gzip",
+        ),
+        ("GET", "/v4/jobs?job=" + "x" * 10_000, None, {}, 422, "?job=NAME must have 1 to 128 printable characters"),
+        ("GET", "/v4/jobs?" + "job=abcdefghijklmnop&" * 3300, None, {}, 422, "The names of 3300 jobs have 62,7"),
+        (
+            "GET",
+            "/v4/fleet",
+            None,
+            {"Origin": "http://evil.example"},
+            403,
+            "may send no requests (got 'http://evil.exam",
+        ),
+        (
+            "GET",
+            "/v4/fleet",
+            None,
+            {"Origin": "null"},
+            403,
+            "Web pages of other hosts may send no requests (got 'null')",
+        ),
+        (
+            "POST",
+            "/v4/jobs",
+            {"jobs": []},
+            {"Sec-Fetch-Site": "cross-site"},
+            403,
+            "(got 'Sec-Fetch-Site: cross-site').",
+        ),
         ("POST", "/v4/jobs", {"jobs": [{**CRATE_JSON, "kind": "fly"}]}, {}, 422, "`. Allowed: hold, pick_place"),
         ("GET", "/v4/fleet?jobs=all", None, {}, 422, "?jobs=N is the number of jobs to list, 0..4096 (got 'all')."),
         ("GET", "/v4/jobs?name=a", None, {}, 422, "There is no parameter 'name' of this request. Parameters: job."),
@@ -301,6 +356,7 @@ def test_a_table_is_submitted_in_messages_or_all_its_faults_are_told(gateway, ar
     assert [len(request.jobs) for request in sent] == [64, 64, 64, 8]
     assert {request.by for request in sent} == {"plan"}
     jobs = [job for request in sent for job in request.jobs]
+    assert [each["job"] for each in told["jobs"]] == [f"{i}/Teil" for i in range(200)]  # as the rows
     assert [job.name for job in jobs] == [f"{i}/Teil" for i in range(199, -1, -1)]  # each after those it waits for
     assert {job.name: job.release_s for job in jobs if job.name != "199/Teil"} == {
         f"{i}/Teil": 60.0 * (i % 60) for i in range(199)
@@ -391,6 +447,22 @@ def test_no_other_origin_is_ever_allowed(gateway):
     assert not [name for name in headers if name.lower().startswith("access-control")]
 
 
+def test_the_page_may_send_requests_and_be_linked_to_from_anywhere(served):
+    own = f"http://127.0.0.1:{served.port}"
+    proxied = {"Origin": "https://fleet.example", "Sec-Fetch-Site": "same-origin"}
+    for headers in ({"Origin": own}, {"Origin": own, "Sec-Fetch-Site": "same-origin"}, proxied):
+        assert get(served, "/v4/fleet", headers)[0] == 200, headers
+    assert get(served, "/", {**BROWSER, "Sec-Fetch-Site": "cross-site"})[0] == 200
+    assert get(served, "/v4/fleet", {"Sec-Fetch-Site": "cross-site"})[0] == 403
+
+
+def test_a_file_of_the_page_is_compressed_if_the_request_accepts_that(served):
+    for accepts, coding in (("identity", None), ("gzip, br", "gzip")):
+        _, headers, text = get(served, "/page/cell.js", {"Accept-Encoding": accepts})
+        assert (headers["Content-Encoding"], headers["Vary"]) == (coding, "Accept, Accept-Encoding")
+        assert len(text) > 500
+
+
 def test_the_stream_has_all_messages(gateway, arm):
     with gateway.stream() as (_, file):
         arm.happens(0)
@@ -417,6 +489,10 @@ def test_a_reader_that_reconnects_misses_no_event(gateway, arm):
         found += events(file, lambda found: len(of("event", found)) == 2)
     assert numbers_of(found) == [101, 102, 103]
     assert not of("gap", found)
+    boot = last.partition("-")[0]
+    with gateway.stream({"Last-Event-ID": f"{boot}-99999999"}) as (_, file):  # no message has had this number yet
+        found = events(file, lambda found: set(numbers_of(found)) >= {100, 101, 102, 103})
+    assert found[0] == (None, "gap", {})
     with gateway.stream({"Last-Event-ID": "otherlife-99999999"}) as (_, file):  # before a restart: all again
         assert events(file, lambda found: set(numbers_of(found)) >= {100, 101, 102, 103})
 

@@ -123,7 +123,7 @@ def test_jobs_beyond_those_that_are_kept_are_counted(monkeypatch):
     seen.forget_other_jobs([reply], 4.0)
     now = seen.snapshot(5.0)
     assert now.counts == counts
-    assert [status.job for status in now.jobs] == ["w2", "w1", "w0", "u"]
+    assert [status.job for status in now.jobs] == ["u", "w0", "w1", "w2"]
     whole = Status("au", 6.0, reply.jobs, counts={"unfinished": 1, "waiting": 3})
     seen.update_jobs(whole, 6.0)
     seen.forget_other_jobs([whole], 5.5)
@@ -135,7 +135,27 @@ def test_a_short_list_has_the_jobs_that_need_somebody_though_others_changed_late
     for number, to in enumerate(("unfinished", "waiting", "finishing", "given_up", "finished", "finished")):
         seen.update("au", result(number, f"j{number}", to), 0.0)
     shown = [[status.job for status in seen.snapshot(0.0, jobs).jobs] for jobs in (0, 1, 2, 4, 9)]
-    assert shown == [[], ["j0"], ["j0", "j2"], ["j0", "j1", "j2", "j5"], [f"j{number}" for number in range(6)]]
+    whole = ["j0", "j2", "j1", "j5", "j4", "j3"]
+    assert shown == [whole[:jobs] for jobs in (0, 1, 2, 4, 6)]
+
+
+@pytest.mark.parametrize("results_first", [True, False])
+def test_a_listener_lists_jobs_in_the_order_of_the_status_pages_whatever_it_has_received_first(results_first):
+    """Of nine ended jobs the last three are in cached results; those that wait are by release."""
+    ended = [JobStatus(f"e{number}", "cancelled" if number % 2 else "finished") for number in range(9)]
+    waiting = tuple(JobStatus(f"w{number}", "waiting", release_s=number) for number in range(3))
+    page = Status("au", 9.0, (*waiting, *reversed(ended)))
+    results = [msgspec.structs.replace(result(number), status=ended[number]) for number in (6, 7, 8)]
+    seen = FleetView("f")
+    for message in [*results, page] if results_first else [page, *results]:
+        if isinstance(message, Status):
+            seen.update_jobs(message, 0.0)
+        else:
+            seen.update("au", message, 0.0)
+    seen.update("au", result(9, "w1", "finished"), 1.0)
+    order = ["w0", "w2", "w1", "e8", "e7", "e6", "e5", "e4", "e3", "e2", "e1", "e0"]
+    for jobs in (4, 6, 12):
+        assert [status.job for status in seen.snapshot(1.0, jobs).jobs] == order[:jobs]
 
 
 def test_an_older_result_changes_nothing_and_a_status_adds_jobs_without_one():
@@ -170,7 +190,7 @@ def test_jobs_that_have_ended_are_dropped_before_those_that_wait(monkeypatch):
     seen = FleetView("f")
     for number in range(10):
         seen.update("au", result(number, f"j{number}", "finished" if number else "waiting"), 0.0)
-    assert [job.job for job in seen.snapshot(0.0).jobs] == ["j0", "j8", "j9"]
+    assert [job.job for job in seen.snapshot(0.0).jobs] == ["j0", "j9", "j8"]
 
 
 def test_too_many_names_drop_the_oldest(monkeypatch):

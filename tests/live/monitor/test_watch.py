@@ -63,6 +63,10 @@ def test_the_screen_tells_why_there_is_no_connection():
     assert EXPIRY in " ".join(told.split())
 
 
+def test_an_event_is_one_line():
+    assert "a\\nb" in shown(fleet_of([arm_now()]), events=["a\nb"])
+
+
 def test_the_screen_tells_who_has_paused_arms():
     assert "All arms are paused by 'root'." in shown(replace(fleet_of([arm_now()]), paused={"*": "root"}))
 
