@@ -19,7 +19,7 @@ from fleet.live import job_client
 from fleet.live.job_client import query_statuses
 from fleet.live.records import JobEntry
 from tests.live.many_jobs import ManyJobs, entries
-from tests.waiting import PATIENCE_S, serving
+from tests.waiting import PATIENCE_S, serving, wait_until
 
 STATES = get_args(JobState)
 STATUS = keys.of_jobs("f", "status")
@@ -132,7 +132,8 @@ def many():
 
 def read_all(link, names=(), **options):
     query = partial(query_statuses, link, names=names, timeout_s=PATIENCE_S, **options)
-    return link.wait(query, PATIENCE_S).first(STATUS)
+    # The router may not know the other client's queryable yet.
+    return wait_until(lambda: (found := link.wait(query, PATIENCE_S)).messages and found).first(STATUS)
 
 
 def test_a_client_reads_all_pages_as_one_reply(many):

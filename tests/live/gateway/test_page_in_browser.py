@@ -242,6 +242,7 @@ def test_a_press_ends_on_the_button_on_which_it_began(served, fleet, open_page):
 
 
 def test_the_counts_follow_the_table_between_two_polls(served, fleet, open_page):
+    fleet.paused["*"] = "ann"
     fleet.post(lambda: fleet.set("crate", state="waiting"))
     page = open_page(served, errors=True)
     expect(page.locator("#counts")).to_have_text("1 waiting.")
