@@ -3,7 +3,7 @@
 Each folder is of `thermofleet compare` on the instances that `--instances` prints, those of the cells of the test split
 with at most eight arms, since past jobs of all arms are simulated for each source:
 
-    thermofleet compare --suite $(python -m benchmarks.knowledge --instances) --out runs/knowledge \
+    thermofleet compare --suite $(python -m benchmarks.knowledge --instances) --trainings 3 --out runs/knowledge \
         --policies bid_price@blind,bid_price@torque,bid_price@untrained,bid_price@trained,bid_price@rc-nominal,\
     bid_price@torque-alone,bid_price@untrained-alone,bid_price@trained-alone,\
     bid_price@rc,mpc@rc,benchmarks/mpc_parts.py:WithoutHeat@rc
