@@ -230,7 +230,18 @@ class Shift(Fleet):
         waiting = (job for name, job in self.submitter.accepted.items() if states.get(name) == "waiting")
         return [job.name for job in waiting if all(states.get(before) == "finished" for before in job.after)]
 
-    def _settle(self) -> None:
+    def _settle_done(self) -> None:
+        """Have a person settle the unfinished jobs that were done, and see that it has its effect."""
+        done = [name for name, state in self.statuses().items() if state == "unfinished" and self.finished.get(name)]
+        for name in done:
+            request(self, Settle(name, "done"))
+        deadline_s = self.world.now_s + SETTLE_S
+        while left := [name for name in done if self.statuses()[name] == "unfinished"]:
+            if self.world.now_s > deadline_s:
+                raise Violation(f"'{left[0]}' was settled as done, and is called unfinished.")
+            self.world.run(self.world.now_s + CHECK_S)
+
+    def _wait_until_settled(self) -> None:
         deadline_s = self.world.now_s + SETTLE_S + 3.0 * self.work_s
         idle_s = self.world.now_s
         while self._open():
@@ -245,6 +256,11 @@ class Shift(Fleet):
                 elif self.world.now_s > (since_s := max(idle_s, self.departed_s)) + IDLE_S:
                     idle_for_s = self.world.now_s - since_s
                     raise Violation(f"'{jobs[0]}' could begin, and all arms are idle for {idle_for_s:.1f} s.")
+
+    def _settle(self) -> None:
+        self._wait_until_settled()
+        self._settle_done()
+        self._wait_until_settled()
         self.unsure |= {job for builder in self.builders.values() for job in builder.unsure}
         states = self.statuses()
         results = [each.status for each in self.sent.messages.values() if isinstance(each, Result)]
