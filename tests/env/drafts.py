@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from fleet.engine.profile_plant import ProfilePlant
 from fleet.engine.world import World
+from fleet.fields import MAX_SEED
 from fleet.job import Job
 from fleet.robot import ThermalLimits
 
@@ -59,7 +60,7 @@ def drafts(draw: Any) -> Draft:
         power_off=draw(st.booleans()),
         touching=draw(st.sampled_from([0.0, 0.3, 1.0])),
         move_home_s=draw(st.sampled_from([900.0, 60.0, 0.0])),
-        seed=draw(st.integers(0, 2**32)),
+        seed=draw(st.integers(0, MAX_SEED)),
     )
 
 
