@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 
 from playwright.sync_api import sync_playwright
 
+from scenarios.train.pairs import PairLearner
 from scenarios.train.training import draw_curves
 
 ROOT = Path(__file__).parents[1]
@@ -130,7 +131,8 @@ def main() -> None:
     for scenario in CELLS:
         thermofleet("layout", scenario, "--out", str(PICTURES / "library" / f"{scenario}.png"), "--overwrite")
     trainings = sorted((ROOT / "docs" / "results" / "learned").glob("train-pairs-*"))
-    draw_curves(trainings, PICTURES / "learning_pairs.png", "normalised score", teacher_name="bid_price")
+    curve = PICTURES / "learning_pairs.png"
+    draw_curves(trainings, curve, PairLearner.unit, teacher_name=PairLearner.teacher_name)
     draw_knowledge(PICTURES / "knowledge.png")
     draw_amounts(PICTURES / "amounts.png")
     for picture in sorted(PICTURES.rglob("*.*")):

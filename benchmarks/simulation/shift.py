@@ -236,7 +236,7 @@ class Shift(Fleet):
         for name in done:
             request(self, Settle(name, "done"))
         deadline_s = self.world.now_s + SETTLE_S
-        while left := [name for name in done if self.statuses()[name] == "unfinished"]:
+        while left := [name for name, state in self.statuses().items() if name in done and state == "unfinished"]:
             if self.world.now_s > deadline_s:
                 raise Violation(f"'{left[0]}' was settled as done, and is called unfinished.")
             self.world.run(self.world.now_s + CHECK_S)

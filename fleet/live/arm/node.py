@@ -461,7 +461,7 @@ class ArmNode:
 
         The last state says that the arm leaves. At the latest it ends when `time.monotonic()` is `until_s`.
         """
-        self._config, self._leaving = replace(self._config, takes_jobs=False), True
+        self._leaving = True
         self.executor.return_all(self._body.time_s, time.monotonic(), "The arm was stopped.")
         reported_s = time.monotonic() if self.executor.has_pending_reports else -math.inf
         while time.monotonic() < until_s:
@@ -589,7 +589,7 @@ class ArmNode:
 
     def unfit(self) -> str:
         """Why the arm accepts no work now; "" if it does."""
-        if not self._config.takes_jobs:
+        if not self._takes_jobs:
             return "I take no jobs"
         if self._reading.mode == "faulted":
             return "I am faulted"
@@ -622,6 +622,10 @@ class ArmNode:
             self._send_state()
 
     @property
+    def _takes_jobs(self) -> bool:
+        return self._config.takes_jobs and not self._leaving
+
+    @property
     def _period_s(self) -> float:
         """Real seconds between two states, and between two steps of the body."""
         return max(1.0 / self._config.rate_hz, IDLE_PERIOD_S if self._idle else 0.0)
@@ -629,7 +633,7 @@ class ArmNode:
     def _set_pace(self, real_s: float) -> None:
         """Step the body and publish its state less often while an arm that takes jobs has none and is at home."""
         at_home = self._body.is_free and self._body.away is None
-        idle = at_home and not self.executor.active and self._config.takes_jobs
+        idle = at_home and not self.executor.active and self._takes_jobs
         if idle != self._idle:
             self._idle, self._state_due_s = idle, real_s
             self._body.set_step(self._period_s * self.clock.speed)

@@ -36,7 +36,7 @@ from fleet.bus.protocol.operator import ALL_ARMS, Alarm, ControlRequest, Operati
 from fleet.errors import BusError
 from fleet.events import EVENT_KINDS
 from fleet.live.job_client import query_statuses
-from fleet.live.job_rules import urgency
+from fleet.live.job_rules import Position, urgency
 from fleet.live.sensors import ArmSensors
 from fleet.telemetry import Mode
 
@@ -591,12 +591,12 @@ def _has_all(reply: Status) -> bool:
 def _most_urgent(statuses: Sequence[JobStatus], most: int) -> tuple[JobStatus, ...]:
     """Return the first `most` statuses in the order of `Status.jobs`; of the ended ones, the last is the newest."""
 
-    def order(i: int) -> tuple[int, float, str]:
+    def position(i: int) -> Position:
         status = statuses[i]
-        group = urgency(status.state, shift_ended=status.shift_ended)
-        return (group, -i, "") if status.state in ENDED else (group, status.release_s or 0.0, status.job)
+        order = -i if status.state in ENDED else status.release_s or 0.0
+        return Position(urgency(status.state, shift_ended=status.shift_ended), order, status.job)
 
-    return tuple(statuses[i] for i in sorted(range(len(statuses)), key=order)[:most])
+    return tuple(statuses[i] for i in sorted(range(len(statuses)), key=position)[:most])
 
 
 def _arm_snapshot(name: str, arm: _Arm, now_s: float, speed: float | None, ended: Container[str]) -> ArmSnapshot:
