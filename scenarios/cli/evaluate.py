@@ -288,8 +288,10 @@ def bounds_command(
     ),
     *,
     suite: str | None = option("All instances of a split: train, validation or test.", None),
-    seeds: int = option("Number of seeds of each scenario.", 5, low=1, high=10_000),
-    first_seed: int = option("First seed.", 0, low=0, high=MAX_SEED),
+    seeds: int | None = option(
+        "Number of seeds of each scenario; default: 5. An instance has one, its own.", None, low=1, high=10_000
+    ),
+    first_seed: int = option("First seed of each scenario.", 0, low=0, high=MAX_SEED),
     budget: Annotated[Given, From(Budget)],
     starts: str | None = option(
         "Policies that the search starts from, separated by commas; default: all but random. Without "

@@ -288,10 +288,21 @@ def _references_in(rows: Rows, keys: Iterable[str]) -> list[ShiftReference]:
         return msgspec.convert(rows.some(keys), list[ShiftReference])
 
 
-def tasks_of(names: str, seeds: int, first_seed: int) -> list[Instance]:
-    """What is to be bounded: a split, or names separated by commas. An instance has one seed."""
+SEEDS = 5
+"""Seeds of a scenario without a number."""
+
+
+def tasks_of(names: str, seeds: int | None, first_seed: int) -> list[Instance]:
+    """What is to be bounded: a split, or names separated by commas. An instance has one seed.
+
+    Raises:
+        FleetError: a name occurs twice, or there are `seeds` and instances only.
+    """
     tasks: list[Instance] = []
-    for case in suite_of(names, seeds, first_seed):
+    cases = suite_of(names, seeds or SEEDS, first_seed)
+    if seeds is not None and all("/" in case.name for case in cases):
+        raise FleetError(f"Each instance has one seed, its own: leave --seeds {seeds} out.")
+    for case in cases:
         if "/" in case.name:
             tasks.append(Instance(case.name, case.scenario, case.seeds[0]))
         else:

@@ -273,3 +273,18 @@ def test_stored_schedules_still_have_their_rewards():
         world = ShiftFactory(fleet)(np.random.SeedSequence(own.seed)).world
         simulator = ShiftSimulator(without_scores(world), weights_of(fleet.scenario), 1)
         assert simulator.follow([ScheduleReplay(each.claims)]).reward[0] == pytest.approx(each.hindsight, rel=1e-6)
+
+
+def test_an_instance_has_one_seed_and_a_scenario_as_many_as_given():
+    assert [task.name for task in stored.tasks_of("test/0013,quickstart", 2, 0)] == [
+        "test/0013",
+        "quickstart/0",
+        "quickstart/1",
+    ]
+    assert len(stored.tasks_of("quickstart", None, 0)) == 5
+    assert [task.seed for task in stored.tasks_of("test/0013,test/0014", None, 0)] == [
+        instance("test/0013").seed,
+        instance("test/0014").seed,
+    ]
+    with pytest.raises(FleetError, match="leave --seeds 2 out"):
+        stored.tasks_of("test/0013", 2, 0)
