@@ -59,13 +59,13 @@ from scenarios.evaluate.leaderboard import (
 )
 from scenarios.evaluate.references import load_references, reference_table
 from scenarios.evaluate.rollout import FIGURES, KINDS
-from scenarios.evaluate.scores import Normalised, SuiteScores, normalised, ranked, score_cells, scores_of
+from scenarios.evaluate.scores import Normalised, SuiteScores, normalised, ranked, score_cells, scores_of, split_file
 from scenarios.evaluate.statistics import LEVEL, Interval, holm, unit
 from scenarios.json_rows import Rows
 from scenarios.policy_loader import trainings_of
 from scenarios.spec.schema import SPLITS, SurpriseKind
 from scenarios.suite.instances import FAULTS, JUDGED, Bus
-from scenarios.suite.splits import cell_of_instance, heat_binds, instance, manifest
+from scenarios.suite.splits import cell_name, cell_of_instance, heat_binds, instance, manifest
 from scenarios.table import markdown_table as table
 
 Array = np.ndarray
@@ -180,6 +180,7 @@ def benchmark_tables(results: Path) -> dict[str, Callable[[], str]]:
         "leaderboard_bus": partial(by_bus, results / "leaderboard"),
         "leaderboard_top": partial(board_top, results / "leaderboard"),
         "leaderboard_knowledge": partial(knowledge, results / "leaderboard"),
+        "leaderboard_fresh": partial(fresh, results / "fresh.json"),
         "leaderboard_planners": partial(planners, results / "leaderboard"),
         "leaderboard_surprises": partial(surprises, results / "leaderboard"),
         **{f"leaderboard_{split}": partial(board_text, results / "leaderboard", split) for split in JUDGED},
@@ -342,21 +343,66 @@ def knowledge(folder: Path) -> str:
         f"{len(values.instances)} instances in {len(set(values.cells))} cells; heat binds in {int(hot.sum())}, "
         f"{int(surprised.sum())} of them with a surprise. Mean score of the hindsight: {values.reachable}."
     )
-    own, alone = values.only(hot), "trained-alone"
-    others = {"torque-alone": "squared torque", "untrained-alone": "errors of the untrained twin"}
-    if {alone, *others} <= found.keys():
-        gains = [own.difference(alone, name) for name in others]
-        adjusted = holm([gain.p for gain in gains]).tolist()
-        texts = [
-            f"less {what} {bold_if(p < 1 - LEVEL, gain.text(3))} (p = {gain.p:.3f}, {p:.3f} after Holm's correction)"
-            for what, gain, p in zip(others.values(), gains, adjusted, strict=True)
-        ]
-        count += f" Where heat binds, without thermometers, errors of the twin {' and '.join(texts)}."
+    if {"trained-alone", "torque-alone", "untrained-alone"} <= found.keys():
+        count += f" Where heat binds, without thermometers, {twin_against_rivals(values.only(hot))}."
     trainings = {name: found[name].card.trainings for name in found if found[name].card.trainings > 1}
     if trainings:
         listed = ", ".join(f"`{name}`" for name in trainings)
         count += f" Mean of {min(trainings.values())} trainings of every arm's twin: {listed}."
     return table((*heads, "share, surprise", "faults"), rows) + f"\n\n{count}"
+
+
+def twin_against_rivals(values: Normalised) -> str:
+    """Score of the errors of the twin as a feature, less that of the simpler ones."""
+    others = {"torque-alone": "squared torque", "untrained-alone": "errors of the untrained twin"}
+    gains = [values.difference("trained-alone", name) for name in others]
+    adjusted = holm([gain.p for gain in gains]).tolist()
+    texts = [
+        f"less {what} {bold_if(p < 1 - LEVEL, gain.text(3))} (p = {gain.p:.3f}, {p:.3f} after Holm's correction)"
+        for what, gain, p in zip(others.values(), gains, adjusted, strict=True)
+    ]
+    return f"errors of the twin {' and '.join(texts)}"
+
+
+def fresh(file: Path) -> str:
+    """As `knowledge`, on fresh shifts of the instances in which heat binds; see benchmarks/knowledge.py."""
+    by_source: dict[str, dict[str, Any]] = json.loads(file.read_text(encoding="utf-8"))
+    references = {each.instance: each for each in load_references(split_file("test"))}
+    names = tuple(by_source["blind"]["reward"])
+    values = Normalised(
+        instances=names,
+        cells=tuple(map(cell_name, names)),
+        score={
+            source: np.array([[references[name].normalised(each["reward"][name]) for name in names]])
+            for source, each in by_source.items()
+        },
+        hindsight=np.array([references[name].normalised(references[name].hindsight) for name in names]),
+    )
+    surprised = values.only(~np.isin(surprise_where_heat_binds(values), ("", "nothing")))
+    rows = [
+        (
+            KNOWLEDGE[source],
+            f"`{source}`",
+            *(each.difference(source, "blind").text() for each in (values, surprised)),
+            *(share_of_gain(each, source) for each in (values, surprised)),
+            *(
+                f"{np.mean([by_source[source]['faults'][name] for name in each.instances]):.2f}"
+                for each in (values, surprised)
+            ),
+        )
+        for source in KNOWLEDGE
+        if source in by_source
+    ]
+    corrected = [each.difference("twin", "rc") for each in (values, surprised)]
+    heads = ("the arms know", "source", "score, less `blind`", "the same, surprise", "share of the gain",
+             "share, surprise", "faults", "faults, surprise")  # fmt: skip
+    seeds, trainings = by_source["blind"]["seeds"], by_source["trained-alone"]["trainings"]
+    return table(heads, rows) + (
+        f"\n\n{len(names)} instances in {len(set(values.cells))} cells, {len(surprised.instances)} of them with a "
+        f"surprise; {seeds} fresh shifts each, {trainings} trainings of every arm's twin. Without thermometers, "
+        f"{twin_against_rivals(values)}. Corrected less identified network {shown(corrected[0])}, in the instances "
+        f"with a surprise {shown(corrected[1])}."
+    )
 
 
 def share_of_gain(values: Normalised, name: str) -> str:

@@ -8,6 +8,7 @@ import asyncio
 import hashlib
 import hmac
 import ipaddress
+import itertools
 import logging
 import os
 import ssl
@@ -32,7 +33,10 @@ MOST_WAITING = 2 * MAX_ALARMS
 REPLY_S = 5.0
 """Real seconds for a whole request."""
 RETRY_S = (1.0, 5.0, 30.0, 120.0)
-"""Real seconds before each repetition; after the last one the alarm is dropped for this target."""
+"""Real seconds before each repetition; the last one is repeated while the target is down."""
+TOO_EARLY = (408, 425, 429)
+"""Of the statuses from 400 to 499 those that a repetition may change; with another one the alarm is dropped for this
+target after the repetitions of `RETRY_S`, so that it does not hold up the next ones."""
 
 
 class Webhook:
@@ -83,16 +87,16 @@ class Webhook:
                 await self._woken.wait()
                 continue
             body = self._waiting.popleft()
-            for attempt, wait_s in enumerate((*RETRY_S, None)):
-                problem = await self._attempt(body)
+            for attempt in itertools.count():
+                problem, final = await self._attempt(body)
                 if not problem or attempt:  # one attempt may fail
                     self.problem = problem
                 if not problem:
                     break
-                if wait_s is None:
+                if final and attempt >= len(RETRY_S):
                     _LOG.error("'%s' did not accept an alarm (%s): it is dropped there.", self.url, problem)
-                else:
-                    await asyncio.sleep(wait_s)
+                    break
+                await asyncio.sleep(RETRY_S[min(attempt, len(RETRY_S) - 1)])
 
     def findings(self) -> tuple[Finding, ...]:
         """A warning while the target accepts nothing; without the path of the URL, which may be secret."""
@@ -101,16 +105,16 @@ class Webhook:
         target = f"{self._named}:{self._port}"
         return (Finding("warning", f"The webhook at {target} accepts no alarms: {problem}.", "webhook", target),)
 
-    async def _attempt(self, body: bytes) -> str:
-        """Send one request; return why it was not accepted, or ""."""
+    async def _attempt(self, body: bytes) -> tuple[str, bool]:
+        """Send one request; return why it was not accepted, or "", and whether the target judged this alarm."""
         try:
             async with asyncio.timeout(REPLY_S):
                 status = await self._post(body)
         except TimeoutError:
-            return f"no reply within {REPLY_S:g} s"
+            return f"no reply within {REPLY_S:g} s", False
         except (OSError, ValueError) as error:
-            return str(error) or type(error).__name__
-        return "" if 200 <= status < 300 else f"status {status}"
+            return str(error) or type(error).__name__, False
+        return "" if 200 <= status < 300 else f"status {status}", 400 <= status < 500 and status not in TOO_EARLY
 
     async def _post(self, body: bytes) -> int:
         """Status of the reply, whose body is not read: it may have any size."""

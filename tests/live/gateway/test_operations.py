@@ -292,6 +292,31 @@ def test_a_webhook_is_signed_and_repeated_until_it_is_accepted(monkeypatch):
         assert digest == hmac.new(SECRET.encode(), f"{at}.".encode() + body, hashlib.sha256).hexdigest()
 
 
+@pytest.mark.parametrize(
+    ("replies", "numbers"),
+    [
+        ([503] * 20, [1] * 21 + [2]),  # down for longer than all pauses: it gets every alarm when it is up again
+        ([429] * 20, [1] * 21 + [2]),
+        ([404] * 20, [1] * 3 + [2] * 3),  # an alarm that it refuses does not hold up the next one
+    ],
+)
+def test_an_alarm_waits_for_a_target_that_is_down_and_not_for_one_that_refuses_it(monkeypatch, replies, numbers):
+    monkeypatch.setattr(webhooks, "RETRY_S", (0.0, 0.0))
+
+    async def run():
+        requests = asyncio.Queue()
+        async with await receiver(replies, requests) as server, asyncio.timeout(PATIENCE_S):
+            hook = Webhook(f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}", SECRET)
+            task = asyncio.create_task(hook.run())
+            hook.send(ALARM)
+            hook.send(msgspec.structs.replace(ALARM, number=2))
+            received = [await requests.get() for _ in numbers]
+            task.cancel()
+            return received
+
+    assert [json.loads(body)["number"] for _, body in asyncio.run(run())] == numbers
+
+
 def test_a_target_that_accepts_nothing_raises_an_alarm_until_it_accepts_one(monkeypatch):
     """Its finding has the reason and no path, which may be secret; one failed attempt raises none."""
     monkeypatch.setattr(webhooks, "RETRY_S", (0.0, 0.0))
