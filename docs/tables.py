@@ -12,6 +12,7 @@ import json
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -182,7 +183,7 @@ def benchmark_tables(results: Path) -> dict[str, Callable[[], str]]:
         "leaderboard_knowledge": partial(knowledge, results / "leaderboard"),
         "leaderboard_fresh": partial(fresh, results / "fresh.json"),
         "leaderboard_planners": partial(planners, results / "leaderboard"),
-        "leaderboard_surprises": partial(surprises, results / "leaderboard"),
+        "leaderboard_surprises": partial(surprises, results / "fresh.json"),
         **{f"leaderboard_{split}": partial(board_text, results / "leaderboard", split) for split in JUDGED},
     }
 
@@ -364,44 +365,61 @@ def twin_against_rivals(values: Normalised) -> str:
     return f"errors of the twin {' and '.join(texts)}"
 
 
+@dataclass(frozen=True)
+class FreshShifts:
+    """Results of benchmarks/knowledge.py on fresh shifts of the instances in which heat binds."""
+
+    values: Normalised
+    """By source; the zero and the unit of an instance are those of its shift of the split."""
+    faults: dict[str, Array]
+    """By source, [instance]."""
+    seeds: int
+    trainings: int
+
+    @classmethod
+    def read(cls, file: Path) -> "FreshShifts":
+        """From the file of the benchmark."""
+        found: dict[str, dict[str, Any]] = json.loads(file.read_text(encoding="utf-8"))
+        references = {each.instance: each for each in load_references(split_file("test"))}
+        own = {name: references[name] for name in found["blind"]["reward"]}
+        values = Normalised(
+            instances=tuple(own),
+            cells=tuple(map(cell_name, own)),
+            score={
+                source: np.array([[each.normalised(of_source["reward"][name]) for name, each in own.items()]])
+                for source, of_source in found.items()
+            },
+            hindsight=np.array([each.normalised(each.hindsight) for each in own.values()]),
+        )
+        faults = {source: np.array([each["faults"][name] for name in own]) for source, each in found.items()}
+        return cls(values, faults, found["blind"]["seeds"], found["trained-alone"]["trainings"])
+
+
 def fresh(file: Path) -> str:
-    """As `knowledge`, on fresh shifts of the instances in which heat binds; see benchmarks/knowledge.py."""
-    by_source: dict[str, dict[str, Any]] = json.loads(file.read_text(encoding="utf-8"))
-    references = {each.instance: each for each in load_references(split_file("test"))}
-    names = tuple(by_source["blind"]["reward"])
-    values = Normalised(
-        instances=names,
-        cells=tuple(map(cell_name, names)),
-        score={
-            source: np.array([[references[name].normalised(each["reward"][name]) for name in names]])
-            for source, each in by_source.items()
-        },
-        hindsight=np.array([references[name].normalised(references[name].hindsight) for name in names]),
-    )
-    surprised = values.only(~np.isin(surprise_where_heat_binds(values), ("", "nothing")))
+    """As `knowledge`, on fresh shifts."""
+    results = FreshShifts.read(file)
+    values = results.values
+    surprised = ~np.isin(surprise_where_heat_binds(values), ("", "nothing"))
+    parts = values, values.only(surprised)
     rows = [
         (
-            KNOWLEDGE[source],
+            meaning,
             f"`{source}`",
-            *(each.difference(source, "blind").text() for each in (values, surprised)),
-            *(share_of_gain(each, source) for each in (values, surprised)),
-            *(
-                f"{np.mean([by_source[source]['faults'][name] for name in each.instances]):.2f}"
-                for each in (values, surprised)
-            ),
+            *(shown(part.difference(source, "blind")) for part in parts),
+            *(share_of_gain(part, source) for part in parts),
+            *(f"{results.faults[source][chosen].mean():.2f}" for chosen in (surprised | True, surprised)),
         )
-        for source in KNOWLEDGE
-        if source in by_source
+        for source, meaning in KNOWLEDGE.items()
+        if source in values.score
     ]
-    corrected = [each.difference("twin", "rc") for each in (values, surprised)]
     heads = ("the arms know", "source", "score, less `blind`", "the same, surprise", "share of the gain",
              "share, surprise", "faults", "faults, surprise")  # fmt: skip
-    seeds, trainings = by_source["blind"]["seeds"], by_source["trained-alone"]["trainings"]
+    corrected = [shown(part.difference("twin", "rc")) for part in parts]
     return table(heads, rows) + (
-        f"\n\n{len(names)} instances in {len(set(values.cells))} cells, {len(surprised.instances)} of them with a "
-        f"surprise; {seeds} fresh shifts each, {trainings} trainings of every arm's twin. Without thermometers, "
-        f"{twin_against_rivals(values)}. Corrected less identified network {shown(corrected[0])}, in the instances "
-        f"with a surprise {shown(corrected[1])}."
+        f"\n\n{len(surprised)} instances in {len(set(values.cells))} cells, {int(surprised.sum())} of them with a "
+        f"surprise; {results.seeds} fresh shifts each, {results.trainings} trainings of every arm's twin. Without "
+        f"thermometers, {twin_against_rivals(values)}. Corrected less identified network {corrected[0]}, with a "
+        f"surprise {corrected[1]}."
     )
 
 
@@ -427,25 +445,23 @@ def share_of_gain(values: Normalised, name: str) -> str:
     return f"{best:.2f} [{ends[0]:.2f}, {ends[1]:.2f}]"
 
 
-def surprises(folder: Path) -> str:
-    """Faults and scores where heat binds by what surprises the arms, of the networks with and without corrections."""
-    found, values = known_scores(folder)
-    kind = surprise_where_heat_binds(values)
+def surprises(file: Path) -> str:
+    """Faults and scores on fresh shifts by what surprises the arms, of the networks with and without corrections."""
+    results = FreshShifts.read(file)
+    kind = surprise_where_heat_binds(results.values)
     parts = {each: kind == each for each in ("nothing", *get_args(SurpriseKind))}
-    parts["any of these"] = ~np.isin(kind, ("", "nothing"))
-    shown_sources = ("rc", "twin", "oracle")
+    parts["any of these"] = kind != "nothing"
     rows: list[tuple[str, ...]] = []
     for name, chosen in parts.items():
-        own = values.only(chosen)
-        faults = {source: faults_in(found[source], own.instances) for source in shown_sources}
+        own = results.values.only(chosen)
+        faults = {source: results.faults[source][chosen] for source in ("rc", "twin", "oracle")}
         fewer = own.interval((faults["twin"] - faults["rc"])[None])
-        means = [f"{own.score[source].mean():.2f}" for source in shown_sources]
         counts = [f"{each.mean():.2f}" for each in faults.values()]
-        cells = (f"{len(own.instances)} in {len(set(own.cells))}", *counts, shown(fewer), *means)
-        rows.append((name, *cells, shown(own.difference("twin", "rc"))))
-    sources, less = ("network", "corrected", "true state"), "corrected less network"
-    heads = (*(f"faults, {each}" for each in sources), less, *(f"score, {each}" for each in sources), less)
-    return table(("surprise", "instances in cells", *heads), rows)
+        gains = [shown(own.difference(source, "rc")) for source in ("twin", "oracle")]
+        rows.append((name, f"{len(own.instances)} in {len(set(own.cells))}", *counts, shown(fewer), *gains))
+    heads = ("surprise", "instances in cells", "faults, network", "faults, corrected", "faults, true state",
+             "corrected less network", "score, corrected less network", "score, true state less network")  # fmt: skip
+    return table(heads, rows)
 
 
 CENTRAL, ALONE, BLIND = "bid_price", "wsept_local", "wspt"
