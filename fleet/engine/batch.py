@@ -99,6 +99,7 @@ def reset_rows(
             job["kind"], job["repetitions"], job["expires"] = 0, 1, False
             job["release_s"] = job["due_s"] = np.inf
             job["status"], job["cycles"], job["returns"], job["finished_s"] = WAITING, 0, 0, np.nan
+            job["passes"] = 0
             s.failed_arm[e, j] = -1
             s.after[e, j] = -1
             if exists:

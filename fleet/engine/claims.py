@@ -1,8 +1,9 @@
 """Claims on jobs: what may be claimed, and one winner per job, station and space.
 
 A job can be claimed once it is released, all jobs before it are done, and nobody works on it. Waiting jobs queue by
-release; a job that a fault returned queues again at the end, so it does not block the others. Of two claims for one
-job or station, or by two arms whose plans would touch, the lower shared difficulty wins, then the lower arm index.
+release; a job that a fault returned queues again at the end, so it does not block the others. Nor does one that nobody
+takes: if others wait for a slot, it is put behind them after `MOST_PASSES` decisions. Of two claims for one job or
+station, or by two arms whose plans would touch, the lower shared difficulty wins, then the lower arm index.
 
 An arm takes the space of its whole plan from the award until it is home again, all at once: so nothing can deadlock.
 """
@@ -20,6 +21,7 @@ from fleet.engine.tables import (
     ILLEGAL,
     LOST,
     EventBuffer,
+    Room,
     Simulation,
     Tables,
     record_event,
@@ -31,6 +33,10 @@ Array = np.ndarray
 
 ROUNDING = 1e-9
 """A cycle counts as begun when more than this share of it is over."""
+MOST_PASSES = 6
+"""Decisions in which a job keeps a slot that others wait for, while an arm is idle and does not take it."""
+FOR_PASSED = 4
+"""Of so many slots one is for jobs that were passed over, even if others wait."""
 LARGEST = float(np.finfo(np.float32).max)
 """Claims without a difficulty are ordered behind all others."""
 
@@ -49,7 +55,7 @@ def update_offers(sim: Simulation, rows: Array) -> None:
         e = nonnegative(row)
         env = s.env[e]
         if env["changed"] or env["next_s"] <= env["tick"] * t.dt_s:
-            filled = fill_slots(t, s, sim.offers.slot_job, sim.events, e, slot_kind)
+            filled = fill_slots(t, s, sim.offers.slot_job, sim.events, e, sim.room)
             group_slots(t.stations[nonnegative(env["fleet"])], slot_kind, filled, sim.offers.group[e])
             fill_masks(sim, e, filled, slot_kind, busy)
             env["changed"] = False
@@ -59,17 +65,18 @@ def update_offers(sim: Simulation, rows: Array) -> None:
 
 
 @jit_inline
-def fill_slots(t: Tables, s: State, slot_job: Array, events: EventBuffer, e: int, slot_kind: Array) -> int:
-    """Fill the slots of an env; late jobs expire.
+def fill_slots(t: Tables, s: State, slot_job: Array, events: EventBuffer, e: int, room: Room) -> int:
+    """Fill the slots of an env, with jobs that were passed over last; late jobs expire.
 
     Args:
-        slot_kind: Receives the kinds of their jobs, int [slot].
+        room: Its `slot_kind` receives the kinds of the jobs.
 
     Returns:
         The number of filled slots.
     """
     env, jobs, queue, slots = s.env[e], s.jobs[e], s.queue[e], nonnegative(slot_job.shape[1])
-    now_s, filled, place, next_s = env["tick"] * t.dt_s, 0, nonnegative(env["head"]), np.inf
+    now_s, filled, behind, place, next_s = env["tick"] * t.dt_s, 0, 0, nonnegative(env["head"]), np.inf
+    env["overfull"] = False
     while place < env["number"]:
         j = nonnegative(queue[place])
         job = jobs[j]
@@ -82,24 +89,72 @@ def fill_slots(t: Tables, s: State, slot_job: Array, events: EventBuffer, e: int
             if len(events.what) > 0:
                 record_event(events, EXPIRE, e, -1, j, -1, t.dt_s, 0.0)
             give_up(s, events, e, j, EXPIRED, t.dt_s)
-            place, filled = nonnegative(env["head"]), 0  # jobs in the queue have moved
+            place, filled, behind = nonnegative(env["head"]), 0, 0  # jobs in the queue have moved
+            env["overfull"] = False
             continue
         if job["expires"]:
             next_s = min(next_s, job["due_s"])
-        if filled == slots:  # of the jobs behind, only the late ones matter
+        passed = job["passes"] < 0
+        if env["overfull"] and not passed:
             continue
         ready = True
         for n in range(s.after.shape[2]):
             before = s.after[e, j, n]
             if before >= 0 and jobs[before]["status"] != DONE:
                 ready = False
-        if ready:
-            slot_job[e, filled], slot_kind[filled] = j, job["kind"]
+        if ready and passed and behind < slots:
+            room.behind[behind] = j
+            behind += 1
+        elif ready and not passed and filled < slots:
+            slot_job[e, filled] = j
             filled += 1
-    for k in range(filled, slots):
-        slot_job[e, k] = -1
+        elif ready:
+            env["overfull"] = True
+    if filled + behind > slots:
+        env["overfull"] = True
+        filled = min(filled, slots - min(behind, slots // FOR_PASSED))
+    for n in range(min(behind, slots - filled)):
+        slot_job[e, filled] = room.behind[n]
+        filled += 1
+    for k in range(slots):
+        if k < filled:
+            room.slot_kind[k] = jobs[nonnegative(slot_job[e, k])]["kind"]
+        else:
+            slot_job[e, k] = -1
     env["next_s"] = next_s
     return filled
+
+
+@jit_inline
+def pass_over(sim: Simulation, rows: Array) -> None:
+    """Count that an idle arm has not taken the jobs in the slots of envs in which others wait; put old ones last.
+
+    Args:
+        rows: Envs, int [row].
+    """
+    for row in rows:
+        if sim.state.env[row]["overfull"]:
+            _pass_over(sim.tables, sim.state, sim.offers.slot_job[row], nonnegative(row))
+
+
+@jit
+def _pass_over(t: Tables, s: State, slot_job: Array, e: int) -> None:
+    env, idle = s.env[e], False
+    for a in range(s.arms.shape[1]):
+        idle = idle or (s.arms[e, a]["mode"] == IDLE and not s.arms[e, a]["absent"])
+    if not idle:
+        return
+    now_s = env["tick"] * t.dt_s
+    for k in range(len(slot_job)):
+        j = nonnegative(slot_job[k])
+        job = s.jobs[e, j]
+        if job["status"] == WAITING:
+            job["passes"] += 1
+            if job["passes"] in (0, MOST_PASSES):
+                remove_from_queue(s, e, j)
+                job["passes"], job["queued_s"] = -MOST_PASSES, now_s
+                return_to_queue(s, e, j, now_s)
+                env["changed"] = True
 
 
 @jit_inline
@@ -263,7 +318,7 @@ def award(sim: Simulation, e: int, a: int, action: Any, busy: Array) -> None:
         o.closed[e, w] |= t.excluded[own["plan"], w]
     remove_from_queue(s, e, j)
     env["changed"] = True
-    job["status"] = RUNNING
+    job["status"], job["passes"] = RUNNING, 0
     arm["last_award"], arm["mode"], arm["job"], arm["kind"], arm["pending"] = 1, WORKING, j, kind, True
     arm["plan"], arm["progress_s"], arm["todo"] = own["plan"], 0.0, job["repetitions"] - job["cycles"]
     set_phase(t.plans, arm)

@@ -79,11 +79,12 @@ JOB = np.dtype(
         ("returns", "i1"),
         ("status", "i1"),
         ("expires", "?"),
-        ("unused", "i1"),
+        ("passes", "i1"),
     ],
     align=True,
 )
-"""A job of a shift, half a cache line; see the properties of `State`."""
+"""A job of a shift, half a cache line; see the properties of `State`. `passes` counts the decisions in which an idle
+arm did not take it from a slot that others wait for; below 0 since it was put behind the others."""
 
 ENV = np.dtype(
     [
@@ -99,14 +100,15 @@ ENV = np.dtype(
         ("turn", "i4"),
         ("alarm", "?"),
         ("changed", "?"),
-        ("unused", "i1", 10),
+        ("overfull", "?"),
+        ("unused", "i1", 9),
     ],
     align=True,
 )
 """A shift. `number` counts its jobs, `unfinished` those neither done nor given up; `head` is where its queue begins.
 What is on offer stays as it is until `next_s`, the next release or due date, unless something has `changed`. `turn`
 is the tick at which the next absence begins or ends. `alarm`: an arm at work has passed the warning limit in the last
-step."""
+step. `overfull`: more jobs can be claimed than have slots."""
 
 
 class Column:

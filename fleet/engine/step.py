@@ -11,7 +11,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.engine.claims import cycles_begun, give_up, resolve_claims, return_to_queue, set_phase, update_offers
+from fleet.engine.claims import (
+    cycles_begun,
+    give_up,
+    pass_over,
+    resolve_claims,
+    return_to_queue,
+    set_phase,
+    update_offers,
+)
 from fleet.engine.corrections import compare, line_of
 from fleet.engine.crossings import Crossed, hottest, step_with_crossing
 from fleet.engine.observe import observe
@@ -542,6 +550,7 @@ def take_steps(
             if now & PLAY:
                 note_awards(sim, going, actions)
             if now & MOVE:
+                pass_over(sim, going)
                 step_arms(sim, terms, going)
                 if len(sim.path_c) > 0:
                     keep_path(sim, going)

@@ -275,8 +275,10 @@ class Room(NamedTuple):
     """Stations that are taken, uint64 [word]."""
     slot_kind: Array
     """Kinds of the jobs in the slots, int [slot]."""
+    behind: Array
+    """Jobs that were passed over, in the order of the queue, int [slot]."""
     left: Array
-    """Their repetitions that are left, float32 [slot]."""
+    """Repetitions that are left of the jobs in the slots, float32 [slot]."""
     key: Array
     """By which claims are ordered, [arm]."""
     order: Array
@@ -307,6 +309,7 @@ def room_for(arms: int, slots: int, words: int, rows: int, works: int) -> Room:
         rows=np.zeros(rows, int),
         busy=np.zeros(words, np.uint64),
         slot_kind=np.zeros(slots, int),
+        behind=np.zeros(slots, int),
         left=np.zeros(slots, np.float32),
         key=np.zeros(arms),
         order=np.zeros(arms, int),

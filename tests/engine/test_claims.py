@@ -7,7 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fleet.engine.claims import FOR_PASSED, MOST_PASSES
 from fleet.engine.shift import initial, open_jobs, step
+from fleet.engine.state import DONE, State
 from fleet.engine.world import World
 from fleet.telemetry import IDLE
 from tests.profiles import examples
@@ -133,3 +135,43 @@ def test_more_than_64_stations_are_distinguished(small, stations) -> None:
     world, plant = small.shop([jobs], arms=2, slots=len(jobs))
     state = step(world, initial(world), np.array([[stations, 0]]), plant).state
     assert open_jobs(world, state)[1][0, 1, 1:-1].tolist() == [1] * stations + [0, 0]
+
+
+def play_one(world: World, plant, claims) -> tuple[list[list[int]], State]:
+    """Jobs in the slots at each decision of one arm, which claims the first job of `claims`, else waits; last state."""
+    state, slots = initial(world), []
+    for _ in range(world.ticks):
+        slot_job, mask = open_jobs(world, state)
+        slots.append(slot_job[0].tolist())
+        legal = mask[0, 0, 1:-1].astype(bool) & np.isin(slot_job[0], list(claims))
+        state = step(world, state, np.array([[1 + legal.argmax() if legal.any() else 0]]), plant).state
+    return slots, state
+
+
+def test_jobs_that_nobody_takes_are_put_behind_those_that_wait_for_a_slot(small) -> None:
+    """All of nine jobs come into the four slots, one of which is for jobs that were passed over."""
+    world, plant = world_of(small, [f"place_{i}" for i in range(9)], arms=1, ticks=4 * MOST_PASSES)
+    slots, _ = play_one(world, plant, ())
+    for begin, jobs in enumerate(([0, 1, 2, 3], [4, 5, 6, 0], [7, 8, 1, 2], [3, 0, 4, 5])):
+        assert slots[begin * MOST_PASSES : (begin + 1) * MOST_PASSES] == [jobs] * MOST_PASSES
+
+
+def test_jobs_keep_their_slots_if_no_other_waits_or_no_arm_is_idle(small) -> None:
+    places = [f"place_{i}" for i in range(5)]
+    world, plant = world_of(small, places[:4], arms=1, ticks=3 * MOST_PASSES)
+    assert play_one(world, plant, ())[0] == [[0, 1, 2, 3]] * world.ticks
+    jobs = [small.job("long", small.work("bench"), repetitions=1000), *(small.job(p, small.work(p)) for p in places)]
+    world, plant = small.shop([jobs], arms=1, slots=4, ticks=3 * MOST_PASSES)
+    assert play_one(world, plant, (0,))[0] == [[0, 1, 2, 3]] + [[1, 2, 3, 4]] * (world.ticks - 1)
+
+
+@examples(25)
+@given(st.lists(st.booleans(), min_size=1, max_size=24), st.integers(1, 5))
+def test_no_number_of_jobs_that_nobody_takes_stops_the_others(small, wanted, slots) -> None:
+    """Each group of jobs that fills the slots costs at most `MOST_PASSES` decisions, and each that is done three."""
+    jobs = [small.job(f"j{i}", small.work("bench")) for i in range(len(wanted))]
+    claims, count = [j for j, each in enumerate(wanted) if each], len(wanted)
+    ticks = (MOST_PASSES + 1) * (count // max(1, slots - slots // FOR_PASSED) + 1) + 3 * count
+    world, plant = small.shop([jobs], arms=1, slots=slots, ticks=ticks)
+    _, state = play_one(world, plant, claims)
+    assert (state.status[0, :count] == DONE).tolist() == wanted

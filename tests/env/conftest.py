@@ -52,7 +52,10 @@ def chosen(mask: np.ndarray, numbers: np.ndarray) -> np.ndarray:
 
 
 def slots_of(world: World, state: State) -> list[int]:
-    """Jobs in the slots of env 0 by the rule: released, waiting, nothing to wait for; oldest first; −1 for none."""
+    """Jobs in the slots of env 0 by the rule: released, waiting, nothing to wait for; oldest first; −1 for none.
+
+    Jobs that were passed over come last, and have a quarter of the slots at least.
+    """
     shift, status = world.shifts[0], state.status[0]
     ready = [
         j
@@ -61,6 +64,9 @@ def slots_of(world: World, state: State) -> list[int]:
         and all(status[before] == DONE for before in shift.after[j].tolist() if before >= 0)
     ]
     ready.sort(key=lambda j: (state.queued_s[0, j], j))
+    passed = [j for j in ready if state.jobs["passes"][0, j] < 0]
+    others = [j for j in ready if j not in passed]
+    ready = others[: world.slots - min(len(passed), world.slots // 4)] + passed
     return (ready + [-1] * world.slots)[: world.slots]
 
 
