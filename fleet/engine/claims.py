@@ -33,7 +33,7 @@ Array = np.ndarray
 
 ROUNDING = 1e-9
 """A cycle counts as begun when more than this share of it is over."""
-MOST_PASSES = 6
+MOST_PASSES = 12
 """Decisions in which a job keeps a slot that others wait for, while an arm is idle and does not take it."""
 FOR_PASSED = 4
 """Of so many slots one is for jobs that were passed over, even if others wait."""
