@@ -14,10 +14,12 @@ first seed of each, that of the split, is left out; without a reference of its o
 instance.
 
     hot=$(python -m benchmarks.knowledge --instances --hot)
-    thermofleet compare --suite $hot --seeds 6 --trainings 3 --out runs/fresh_alone \
-        --policies bid_price@blind,bid_price@torque-alone,bid_price@untrained-alone,bid_price@trained-alone
-    thermofleet compare --suite $hot --seeds 6 --out runs/fresh --policies bid_price@rc,bid_price@twin,bid_price@oracle
-    python -m benchmarks.knowledge --fresh runs/fresh_alone runs/fresh
+    thermofleet compare --suite $hot --seeds 6 --trainings 3 --out runs/fresh --policies bid_price@blind,\
+    bid_price@torque-alone,bid_price@untrained-alone,bid_price@trained-alone,\
+    bid_price@torque,bid_price@untrained,bid_price@trained,bid_price@rc-nominal
+    thermofleet compare --suite $hot --seeds 6 --out runs/fresh_rc \
+        --policies bid_price@rc,bid_price@twin,bid_price@oracle,wsept@twin,bid_price_shared@twin
+    python -m benchmarks.knowledge --fresh runs/fresh runs/fresh_rc
 """
 
 import json
@@ -55,8 +57,8 @@ def main(given: list[str]) -> None:
 
 
 def fresh(folders: Iterable[Path]) -> dict[str, dict[str, object]]:
-    """Shifts with other seeds than the split's: by source their seeds and trainings for each instance, and its mean
-    reward and faults."""
+    """Shifts with other seeds than the split's: by source of `bid_price`, and by name for other policies, their seeds and
+    trainings for each instance, and its mean reward and faults."""
     of_split = {line.name: line.seed for line in manifest("test")}
     found: dict[str, dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
     for folder in folders:
@@ -64,7 +66,8 @@ def fresh(folders: Iterable[Path]) -> dict[str, dict[str, object]]:
             if row.outcome is None:
                 raise SystemExit(f"{folder}: a shift of {row.key.instance} failed: {row.error}")
             if row.key.seed != of_split[row.key.instance]:
-                found[row.key.difficulty][row.key.instance].append(row)
+                source = row.key.difficulty if row.key.policy == "bid_price" else row.key.policy
+                found[source][row.key.instance].append(row)
     return {
         source: {
             "seeds": len({row.key.seed for row in next(iter(of_instance.values()))}),

@@ -419,7 +419,8 @@ def fresh(file: Path) -> str:
         f"\n\n{len(surprised)} instances in {len(set(values.cells))} cells, {int(surprised.sum())} of them with a "
         f"surprise; {results.seeds} fresh shifts each, {results.trainings} trainings of every arm's twin. Without "
         f"thermometers, {twin_against_rivals(values)}. Corrected less identified network {corrected[0]}, with a "
-        f"surprise {corrected[1]}."
+        f"surprise {corrected[1]}. With `twin`, `bid_price` less `wsept` {shown(values.difference('twin', 'wsept'))}, "
+        f"less `bid_price_shared` {shown(values.difference('twin', 'bid_price_shared'))}."
     )
 
 
