@@ -48,7 +48,8 @@ MOST_SHEET_S = 7 * DAY_S
 """Of a shift without a known end: numbers of days further on are times in seconds."""
 DATE = "a date with time and zone, as 2026-11-23T06:00+01:00"
 _CLOCK = re.compile(r"(\d{1,4}):([0-5]\d)(?::([0-5]\d(?:[.,]\d+)?))?")
-_ARROW, _OR = re.compile(r"->|→|>"), re.compile(r"[|;,]")
+_ARROW, _SEPARATOR = re.compile(r"->|→|>"), re.compile("[;,]")
+"""Between from and to; and what may be in a name, but is often written instead of `|`."""
 _DOTTED_CLOCK = re.compile(r"([01]?\d|2[0-3])[.,]([0-5]\d)")
 """A time of day as it is written in German; seconds have one decimal or none, as a decision takes them."""
 _MILITARY_CLOCK = re.compile(r"(0\d)([0-5]\d)")
@@ -80,6 +81,8 @@ class _Dialect(NamedTuple):
     """Length of the shift; inf for unknown."""
     day_fractions: bool
     """Whether a number below 1 may be a time of day, as in a sheet."""
+    names: Collection[str] = ()
+    """Of all jobs of the table."""
     factor: float = 1.0
     """Of a plain number, to s or kg."""
     tell: Callable[[str], None] = _LOG.warning
@@ -232,9 +235,18 @@ def seconds_of(given: object, begin: datetime | None, horizon_s: float, tell: Ca
     return _seconds(given, _Dialect(begin, False, horizon_s, False, tell=tell))
 
 
-def _names(cell: Cell, _: object) -> tuple[str, ...]:
-    parts = cell if isinstance(cell, list) else _OR.split(_text(cell))
+def _names(cell: Cell, dialect: _Dialect) -> tuple[str, ...]:
+    parts = cell if isinstance(cell, list) else _names_in(_text(cell), dialect.names)
     return tuple(_label(part) for part in parts if _text(part))
+
+
+def _names_in(text: str, known: Collection[str]) -> list[str]:
+    """Names with `|` between them; commas and semicolons separate, too, where that gives known names only."""
+    names = list[str]()
+    for part in [text] if text in known else text.split("|"):
+        name, several = part.strip(), [each.strip() for each in _SEPARATOR.split(part) if each.strip()]
+        names += several if name not in known and all(each in known for each in several) else [name]
+    return names
 
 
 def _label(cell: Cell, _: object = None) -> str:
@@ -362,13 +374,15 @@ def read_job_table(
     head_row, head = next(lines, (1, ()))
     if len(head) > MOST_COLUMNS:
         raise ScenarioError(f"{where} has {len(head)} columns; a job table has at most {MOST_COLUMNS}.")
-    columns, dialect = _read_head(head_row, head, errors), _Dialect(begin, decimal_comma, horizon_s, is_sheet)
+    columns = _read_head(head_row, head, errors)
     errors.raise_any(where)
+    body = list(islice(lines, MOST_ROWS + 1))
+    if len(body) > MOST_ROWS:
+        raise ScenarioError(f"{where} has too many rows; a job table has at most {MOST_ROWS}.")
+    dialect = _Dialect(begin, decimal_comma, horizon_s, is_sheet, names=_names_of(body, columns))
     no_place = _no_place(places or ())
     rows: dict[str, tuple[int, Row]] = {}
-    for count, (number, cells) in enumerate(lines):
-        if count == MOST_ROWS:
-            raise ScenarioError(f"{where} has too many rows; a job table has at most {MOST_ROWS}.")
+    for number, cells in body:
         if len(cells) > len(head) and not all(map(_is_empty, cells[len(head) :])):
             errors.add(number, "", f"{len(cells)} cells, but the head has {len(head)}; quote cells with separators")
             continue
@@ -397,6 +411,12 @@ def read_job_table(
     if not jobs:
         raise ScenarioError(f"{where} has no jobs; give a row of headings, then one row for each job.")
     return jobs
+
+
+def _names_of(body: Sequence[tuple[int, Sequence[Cell]]], columns: Mapping[int, tuple[str, float]]) -> frozenset[str]:
+    """Names of all jobs of a table."""
+    (index,) = (i for i, (column, _) in columns.items() if column == "name")
+    return frozenset(_text(cells[index]) for _, cells in body if index < len(cells))
 
 
 def check_places(jobs: Mapping[int, JobSpec], places: Collection[str], where: str) -> None:
@@ -525,7 +545,8 @@ def _check_after(rows: Mapping[str, tuple[int, Row]], errors: _Errors, *, closed
     for number, row in rows.values() if closed else ():
         for name in row.after:
             if name not in rows:
-                errors.add(number, "after", f"there is no job '{printable(name)}' in this table")
+                hint = "; give | between names" if _SEPARATOR.search(name) else ""
+                errors.add(number, "after", f"there is no job '{printable(name)}' in this table{hint}")
     if cycle := cycle_of({name: row.after for name, (_, row) in rows.items()}):
         errors.add(rows[cycle[0]][0], "after", f"jobs wait for each other in a cycle: {' → '.join(cycle)}")
 

@@ -127,9 +127,26 @@ def test_the_begin_of_the_shift_is_a_date_of_toml_or_a_text(tmp_path):
         (["a,hold,bench,,,0:02,,,,", "b,hold,bench,,,0:01:30.5,,,,"], [("b", (), 90.5), ("a", (), 120.0)]),
         (["[A] 1/2,hold,bench,,,,,,,", "b,hold,shelf,,,,,,,[A] 1/2"], [("[A] 1/2", (), 0.0), ("b", ("[A] 1/2",), 0.0)]),
         (["4711,hold,bench,,,,,,,", "4711-100,hold,bench,,,,,,,"], [("4711", (), 0.0), ("4711-100", (), 0.0)]),
+        (['"A,2",hold,bench,,,,,,,', 'b,hold,shelf,,,1,,,,"A,2"'], [("A,2", (), 0.0), ("b", ("A,2",), 1.0)]),
+        (
+            ["a,hold,bench,,,,,,,", '"c;d",hold,bench,,,1,,,,', 'b,hold,shelf,,,2,,,,"c;d | a"'],
+            [("a", (), 0.0), ("c;d", (), 1.0), ("b", ("c;d", "a"), 2.0)],
+        ),
+        (
+            ["a,hold,bench,,,,,,,", "c,hold,bench,,,1,,,,", 'b,hold,shelf,,,2,,,,"c, a"'],
+            [("a", (), 0.0), ("c", (), 1.0), ("b", ("c", "a"), 2.0)],
+        ),
         (["a,hold,bench,,,0,,,,b", "b,hold,shelf,,,5,,,,"], [("a", ("b",), 0.0), ("b", (), 5.0)]),
     ],
-    ids=["clock times without a date", "odd names", "a name that continues another", "waiting for a row below"],
+    ids=[
+        "clock times without a date",
+        "odd names",
+        "a name that continues another",
+        "a comma in a name",
+        "a semicolon in a name",
+        "names with commas between",
+        "waiting for a row below",
+    ],
 )
 def test_rows_give_jobs_in_order_of_release(tmp_path, rows, jobs):
     scenario = small_table(tmp_path, "\n".join([SHORT, *rows]))
@@ -236,6 +253,7 @@ ERRORS = {
     "x,hold,bench,,,,,yes,,": "column due: a hard due date needs a time.",
     "x,hold,bench,,,,,maybe,,": "column hard: expected yes or no (got 'maybe').",
     "x,hold,bench,,,,,,,y": "column after: there is no job 'y' in this table.",
+    'x,hold,bench,,,,,,,"y;g"': "column after: there is no job 'y;g' in this table; give | between names.",
     "x,hold,bench,,,,,,,x": "column after: jobs wait for each other in a cycle: x → x.",
     "x,hold,bench,,,,,,,,,9": ": 12 cells, but the head has 10; quote cells with separators.",
 }
