@@ -69,7 +69,10 @@ Rows = Iterator[tuple[int, Sequence[Cell]]]
 
 
 class Row(SimpleNamespace):
-    """Values of one row by field of `JobSpec`; the default where a cell is empty or wrong."""
+    """Values of one row by field of `JobSpec`; the default where a cell is empty or wrong.
+
+    `texts` has the cells of its times as texts, by field.
+    """
 
 
 class _Dialect(NamedTuple):
@@ -116,7 +119,7 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
         raise ValueError(
             f"is this {clock_time}? Give its cell a format of time, or a number as a text (got {_shown(cell)})"
         )
-    text, begin = _text(cell.isoformat() if isinstance(cell, time | datetime) else cell), dialect.begin
+    text, begin = _time_text(cell), dialect.begin
     if clock := _CLOCK.fullmatch(text):
         hours, minutes, seconds = (float((part or "0").replace(",", ".")) for part in clock.groups())
         given_s = 3600 * hours + 60 * minutes + seconds
@@ -284,6 +287,10 @@ def _text(cell: Cell) -> str:
     return f"{cell:.15g}" if isinstance(cell, float) else str(cell).strip()
 
 
+def _time_text(cell: Cell) -> str:
+    return _text(cell.isoformat() if isinstance(cell, time | datetime) else cell)
+
+
 def _shown(cell: Cell) -> str:
     return f"'{printable(str(cell), 60)}'"
 
@@ -397,7 +404,7 @@ def read_job_table(
             errors.add(number, "name", f"'{row.name}' is the name of row {rows[row.name][0]}, too; names are unique")
         elif not wrong:
             fields = {**vars(row), "places": row.every_places[0], "alternatives": row.every_places[1:]}
-            jobs[number] = JobSpec(**{name: value for name, value in fields.items() if name != "every_places"})
+            jobs[number] = JobSpec(**{name: fields[name] for name in fields if name not in ("every_places", "texts")})
         rows.setdefault(row.name, (number, row))
     heaviest_kg = max((row.payload_kg for _, row in rows.values()), default=0.0)
     if ("payload", GRAMS) in columns.values() and 0.0 < heaviest_kg < LIGHT_KG:
@@ -474,7 +481,7 @@ def _read_row(
     doubts: _Errors,
 ) -> tuple[Row, set[str]]:
     """Values of a row, and the fields whose cells cannot be read."""
-    row, wrong = Row(**{field: default for field, _, default in _COLUMNS.values()}), set[str]()
+    row, wrong = Row(**{field: default for field, _, default in _COLUMNS.values()}, texts={}), set[str]()
     for i, (column, factor) in columns.items():
         cell = cells[i] if i < len(cells) else None
         field, convert, _ = _COLUMNS[column]
@@ -482,6 +489,8 @@ def _read_row(
             if not _is_empty(cell):
                 tell = partial(doubts.add, number, column)
                 setattr(row, field, convert(cell, dialect._replace(factor=factor, tell=tell)))
+                if convert is _job_time:
+                    row.texts[field] = _time_text(cell)
             elif column in _NEEDED:
                 raise ValueError("is empty; every job needs one")
         except ValueError as error:
@@ -516,9 +525,16 @@ def _problems(row: Row, wrong: Collection[str]) -> Iterator[tuple[str, str]]:
 
 def _check_due(row: Row) -> None:
     if row.due_s is not None and row.due_s < row.release_s:
-        raise ValueError(f"must not be before the release at {row.release_s:.15g} s (got {row.due_s:.15g} s)")
+        release, due = (_given_time(row, field) for field in ("release_s", "due_s"))
+        raise ValueError(f"must not be before the release at {release} (got {due})")
     if row.expires and row.due_s is None:
         raise ValueError("a hard due date needs a time")
+
+
+def _given_time(row: Row, field: str) -> str:
+    """A time of a row as it was given; a plain number in seconds."""
+    text = row.texts.get(field, "")
+    return printable(text, 60) if ":" in text else f"{getattr(row, field):.15g} s"
 
 
 def _check_force(row: Row) -> None:
