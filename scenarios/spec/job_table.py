@@ -115,7 +115,8 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
     if isinstance(cell, timedelta):
         return cell.total_seconds()
     if dialect.day_fractions and isinstance(cell, float) and 0.0 < cell < 1.0:
-        clock_time = f"{datetime.min + timedelta(days=cell):%H:%M}"
+        hours, minutes = divmod(round(cell * DAY_S) // 60, 60)
+        clock_time = f"{hours:02d}:{minutes:02d}"
         raise ValueError(
             f"is this {clock_time}? Give its cell a format of time, or a number as a text (got {_shown(cell)})"
         )
@@ -186,11 +187,11 @@ def _local_seconds(moment: datetime, given: str, begin: datetime, tell: Callable
 
 
 def _of_sheet(days: float, begin: datetime, horizon_s: float) -> datetime | None:
-    """The date that a spreadsheet stores as these days, if it is on a day of the shift, or on the one after it."""
+    """The date, to the second, that a spreadsheet stores as these days, if it is on a day of the shift or the next."""
     first = (begin.replace(tzinfo=None) - SHEET_ZERO).days
     if not first <= days < first + 2 + min(horizon_s, MOST_SHEET_S) // DAY_S:
         return None
-    return SHEET_ZERO + timedelta(days=days)
+    return SHEET_ZERO + timedelta(seconds=round(days * DAY_S))
 
 
 def check_exists(moment: datetime, given: str) -> None:

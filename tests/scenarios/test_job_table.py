@@ -292,6 +292,7 @@ def test_what_a_german_spreadsheet_writes_is_read_or_asked_about(tmp_path):
             "column release: 22 Nov 2026 06:00 is before the shift, which begins on 23 ",
         ),
         ("a;hold;bench;;;;46349,27;;;", "column due: is this 23 Nov 2026 06:28, in days as a spreadsheet counts? Give"),
+        ("a;hold;bench;;;;46349,9930555;;;", "column due: is this 23 Nov 2026 23:50, in days"),
         ("a;hold;bench;;;;2026-11-24;;;", "column due: a date needs a time, as 2026-11-24T14:00 (got '2026-11-24')"),
         ("a;hold;bench;;;6:01;5:00;;;", "column due: '5:00' is outside the shift, which begins at 06:00 and"),
     ):
@@ -350,19 +351,25 @@ def test_light_payloads_in_grams_are_asked_about(tmp_path):
 def test_times_of_a_sheet_are_those_that_it_shows(tmp_path):
     openpyxl = pytest.importorskip("openpyxl")
     begin, path = datetime(2026, 11, 23, 6, tzinfo=UTC), tmp_path / "jobs.xlsx"
-    for format_, day_fraction, release_s in (("[h]:mm", 0.25, 0.0), ("[h]:mm", 0.5, 21600.0), ("General", 0.25, None)):
+    for format_, day_fraction, release in (
+        ("[h]:mm", 0.25, 0.0),
+        ("[h]:mm", 0.5, 21600.0),
+        ("General", 0.25, "06:00"),
+        ("General", 0.9930555, "23:50"),  # 5 ms less
+        ("General", 0.9999999, "24:00"),
+    ):
         book = openpyxl.Workbook()
         book.active.append(["name", "kind", "places", "release"])
         book.active.append(["a", "hold", "bench", day_fraction])
         book.active["D2"].number_format = format_
         book.save(path)
-        if release_s is None:
+        if isinstance(release, str):
             with pytest.raises(
-                ScenarioError, match=r"is this 06:00\? Give its cell a format of time, or a number as a text"
+                ScenarioError, match=rf"is this {release}\? Give its cell a format of time, or a number as a text"
             ):
                 read_job_table(path, begin=begin)
         else:
-            assert [job.release_s for job in read_job_table(path, begin=begin).values()] == [release_s]
+            assert [job.release_s for job in read_job_table(path, begin=begin).values()] == [release]
 
 
 def test_a_quote_that_is_never_closed_is_told_and_no_row_is_lost(tmp_path):
