@@ -52,6 +52,8 @@ _ARROW, _SEPARATOR = re.compile(r"->|→|>"), re.compile("[;,]")
 """Between from and to; and what may be in a name, but is often written instead of `|`."""
 _DOTTED_CLOCK = re.compile(r"([01]?\d|2[0-3])[.,]([0-5]\d)")
 """A time of day as it is written in German; seconds have one decimal or none, as a decision takes them."""
+_HOURS = re.compile(r"([1-9]|1\d|2[0-3])(?:[.,](\d))?")
+"""A number that is a time of day, in hours or in German, if the other times of a table have minutes."""
 _MILITARY_CLOCK = re.compile(r"(0\d)([0-5]\d)")
 _THOUSANDS = re.compile(r"[1-9]\d{0,2}(\.\d{3})+")
 _GERMAN_DATE = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4}) +(\d{1,2}:\d{2}.*)")
@@ -126,7 +128,7 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
         given_s = 3600 * hours + 60 * minutes + seconds
         return given_s if begin is None else _clock_seconds(text, given_s, begin, dialect)
     if isinstance(cell, str) and (dotted := _DOTTED_CLOCK.fullmatch(text)):
-        number = f"{float(text.replace(',', '.')):.3f}"
+        number = _three_decimals(text, dialect)
         raise ValueError(f"is this {dotted[1]}:{dotted[2]}? Give times as h:mm, or a number as {number}")
     if isinstance(cell, str) and (clock := _MILITARY_CLOCK.fullmatch(text)):
         raise ValueError(f"is this {clock[1]}:{clock[2]}? Give times as h:mm, or a number as {int(text)}")
@@ -140,6 +142,12 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
             f"{moment:%Y-%m-%dT%H:%M} (got {_shown(cell)})"
         )
     return number
+
+
+def _three_decimals(text: str, dialect: _Dialect) -> str:
+    """A number in a form that is no time of day, with the decimal sign of the table."""
+    number = f"{float(text.replace(',', '.')):.3f}"
+    return number.replace(".", ",") if dialect.decimal_comma else number
 
 
 def _clock_seconds(text: str, given_s: float, begin: datetime, dialect: _Dialect) -> float:
@@ -407,6 +415,8 @@ def read_job_table(
             fields = {**vars(row), "places": row.every_places[0], "alternatives": row.every_places[1:]}
             jobs[number] = JobSpec(**{name: fields[name] for name in fields if name not in ("every_places", "texts")})
         rows.setdefault(row.name, (number, row))
+    plain = {column for i, (column, _) in columns.items() if _key_of(head[i]) == column}
+    _check_hours(rows.values(), plain, errors, doubts)
     heaviest_kg = max((row.payload_kg for _, row in rows.values()), default=0.0)
     if ("payload", GRAMS) in columns.values() and 0.0 < heaviest_kg < LIGHT_KG:
         errors.add(
@@ -454,7 +464,7 @@ def _read_head(number: int, head: Sequence[Cell], errors: _Errors) -> dict[int, 
         text = "" if _is_empty(heading) else printable(str(heading).strip())
         if not text or text.startswith("#"):
             continue
-        key = re.sub(r"[^a-z]+", "_", text.lower()).strip("_")
+        key = _key_of(heading)
         column, factor = _SPELLINGS.get(key, ("", 1.0))
         stem, _, unit = key.rpartition("_")
         if not column and stem in _COLUMNS and _UNIT.fullmatch(unit):
@@ -471,6 +481,11 @@ def _read_head(number: int, head: Sequence[Cell], errors: _Errors) -> dict[int, 
     if missing := [name for name in _NEEDED if name not in {column for column, _ in columns.values()}]:
         errors.add(number, "", f"no column {' and no column '.join(missing)}; every job needs {', '.join(_NEEDED)}")
     return columns
+
+
+def _key_of(heading: Cell) -> str:
+    """A heading in lower case, with an underscore for everything between its letters."""
+    return re.sub(r"[^a-z]+", "_", str(heading).lower()).strip("_")
 
 
 def _read_row(
@@ -556,6 +571,29 @@ def with_cell(answer: Answer, jobs: Mapping[str, tuple[str, JobSpec]]) -> Answer
     quoted = (column for column, names in columns.items() if any(f"'{name}'" in answer.reason for name in names))
     place = ", column ".join([row, *islice(quoted, 1)])
     return replace(answer, reason=f"{place}: {answer.reason}")
+
+
+def _check_hours(rows: Collection[tuple[int, Row]], columns: Collection[str], errors: _Errors, doubts: _Errors) -> None:
+    """Check for numbers that are probably hours, in a table with other times as h:mm or dates.
+
+    Args:
+        columns: Those whose headings name no unit.
+        errors, doubts: Get numbers with and without a decimal.
+    """
+    if not any(":" in text for _, row in rows for text in row.texts.values()):
+        return
+    for number, row in rows:
+        for field, text in row.texts.items():
+            column, hours = _COLUMN_OF[field], _HOURS.fullmatch(text)
+            if hours is None or column not in columns:
+                continue
+            hour, tenth = hours[1], int(hours[2] or 0)
+            meant = f"{hour}:{6 * tenth:02d} or {hour}:{tenth}0" if tenth else f"{hour}:00"
+            advice = f"Give times as h:mm, or seconds in a column {column}_s"
+            if hours[2]:
+                errors.add(number, column, f"is this {meant}? {advice} (got {_shown(text)})")
+            else:
+                doubts.add(number, column, f"{_shown(text)} counts as {text} s; is this {meant}? {advice}")
 
 
 def _check_after(rows: Mapping[str, tuple[int, Row]], errors: _Errors, *, closed: bool) -> None:

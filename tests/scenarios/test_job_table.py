@@ -335,6 +335,31 @@ def test_only_plain_numbers_are_scaled_to_the_unit_of_a_heading(tmp_path):
     assert {job.name: (job.release_s, job.due_s) for job in jobs} == {"a": (60.0, 120.0), "b": (0.0, 150.0)}
 
 
+def test_hours_among_clock_times_are_asked_about(tmp_path, caplog):
+    begin = "shift_begin = 2026-11-23T22:00:00+01:00"
+    for heading, time_, sentence in (
+        ("release", "23,5", "column release: is this 23:30 or 23:50? Give times as h:mm, or seconds in a column "),
+        ("release", "23.5", "column release: is this 23:30 or 23:50? Give times as h:mm, or seconds in a column "),
+        ("release", "23,0", "column release: is this 23:00? Give times as h:mm, or seconds in a column release_s (got"),
+        ("release", "23,30", "column release: is this 23:30? Give times as h:mm, or a number as 23,300."),
+        ("release", "23", ""),
+        ("release_s", "23,5", ""),
+        ("release", "23,300", ""),
+        ("release", "24,5", ""),
+    ):
+        text = f"name;kind;places;{heading};due\na;hold;bench;{time_};\nb;hold;bench;;22:02\n"
+        caplog.clear()
+        if sentence:
+            assert sentence in errors_of(tmp_path, text, begin)
+        else:
+            last = drawn(small_table(tmp_path, text, begin), 0)[-1]
+            assert last.release_s == float(time_.replace(",", "."))
+        warned = "row 2, column release: '23' counts as 23 s; is this 23:00? Give times as h:mm" in caplog.text
+        assert warned == (time_ == "23")
+    seconds = "name;kind;places;release;due\na;hold;bench;23,5;60\n"
+    assert drawn(small_table(tmp_path, seconds, begin), 0)[0].release_s == 23.5
+
+
 def test_light_payloads_in_grams_are_asked_about(tmp_path):
     for grams, refused in (("0.5", True), ("200", False)):
         path = tmp_path / "jobs.csv"
