@@ -28,7 +28,7 @@ from fleet.bus.protocol.auction import Admission, JobSpec, JobStatus
 from fleet.errors import ScenarioError, check_names, nearest, printable
 from fleet.files import decode_text
 from fleet.job import BOUNDS, DWELL_S, KINDS, check_alternatives, check_bounds, check_duration, check_dwell
-from scenarios.spec.units import question
+from scenarios.spec.units import check_times, question
 
 _LOG = logging.getLogger(__name__)
 SUFFIXES = (".csv", ".tsv", ".parquet", ".xlsx")
@@ -376,7 +376,8 @@ def read_job_table(
         file: Its path, or the content of a CSV file.
         where: Name of the table in errors; by default the path.
         begin: Of the shift, with its zone; needed for dates.
-        horizon_s: Length of the shift; a time of day before its begin must be within it on the next day.
+        horizon_s: Length of the shift; a time of day before its begin must be within it on the next day, and some job
+            must be released in it.
         places: Of the cell; None: not checked.
         closed: Whether `after` must name rows of the table.
 
@@ -428,6 +429,10 @@ def read_job_table(
         _LOG.warning("%s,%s", where, sentence[1:])
     if not jobs:
         raise ScenarioError(f"{where} has no jobs; give a row of headings, then one row for each job.")
+    if isfinite(horizon_s):
+        times_s = {f"row {number}, '{job.name}',": job.release_s for number, job in jobs.items()}
+        numbers_s = [row.release_s for _, row in rows.values() if ":" not in row.texts.get("release_s", "")]
+        check_times([*times_s.values()], horizon_s, where, [*times_s], numbers_s)
     return jobs
 
 

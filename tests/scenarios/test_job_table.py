@@ -479,21 +479,31 @@ def test_a_thousand_rows_are_read_and_all_their_errors_told_soon(tmp_path):
     assert time.process_time() - began_s < SOON_S
 
 
+def test_clock_times_are_not_asked_to_be_minutes(tmp_path, caplog):
+    for times, asked in ((("1", "2", "3"), True), (("0:01", "0:02", "0:03"), False), (("0:00:01", "2", "3"), False)):
+        caplog.clear()
+        rows = [f"j{i},hold,bench,,,{time_},,,," for i, time_ in enumerate(times)]
+        small_table(tmp_path, "\n".join([SHORT, *rows]))
+        assert ("Are these minutes? 3 min is 180 s." in caplog.text) == asked, times
+
+
 def test_jobs_that_cannot_finish_in_time_are_told(tmp_path, caplog, plans):
     table = small_table(tmp_path, f"{SHORT}\na,hold,bench,,,,1,,,\nb,hold,bench,,,,1,yes,,\nc,hold,bench,,,179,,,,\n")
+    clock_times = small_table(tmp_path, f"{SHORT}\na,hold,bench,,200,0:01,0:02,,,\n")
     raw = tomllib.loads(SMALL) | {"name": "heat", "horizon_s": 10}
     raw["jobs"][1]["due_s"] = 0.5
     late = raw | {
         "name": "late",
         "jobs": [raw["jobs"][0] | {"arrivals": {"kind": "batch", "count": 1, "start_s": 11.0}}],
     }
-    for scenario in (table, parse_scenario(raw, tmp_path), parse_scenario(late, tmp_path)):
+    for scenario in (table, clock_times, parse_scenario(raw, tmp_path), parse_scenario(late, tmp_path)):
         prepare(scenario, difficulty="blind", cache=plans)
     assert [re.sub(r"[\d.]+ s \(", "… s (", each.message) for each in caplog.records] == [
         "cell.toml: 'jobs.csv', row 2, column due: 'a' takes at least … s (1 cycle), but has 1 s until it is due. Are "
         "its times minutes? Give seconds.",
         "cell.toml: 'jobs.csv', row 4, column release: 'c' takes at least … s (1 cycle), but has 1 s until the shift "
         "ends. Are its times minutes? Give seconds.",
+        "cell.toml: 'jobs.csv', row 2, column due: 'a' takes at least … s (200 cycles), but has 60 s until it is due.",
         "heat.toml: horizon_s: 'hold' takes at least … s (1 cycle), but has 10 s until the shift ends. Are its times "
         "minutes? Give seconds.",
         "heat.toml: jobs[1].due_s: 'sort' takes at least … s (1 cycle), but has 0.5 s until it is due. Are its times "
