@@ -425,6 +425,7 @@ def read_job_table(
         )
     _check_after(rows, errors, closed=closed)
     errors.raise_any(where)
+    _check_order({row.name: (number, row) for number, row in rows.values() if number in jobs}, doubts)
     for sentence in doubts.lines():
         _LOG.warning("%s,%s", where, sentence[1:])
     if not jobs:
@@ -609,6 +610,28 @@ def _check_after(rows: Mapping[str, tuple[int, Row]], errors: _Errors, *, closed
                 errors.add(number, "after", f"there is no job '{printable(name)}' in this table{hint}")
     if cycle := cycle_of({name: row.after for name, (_, row) in rows.items()}):
         errors.add(rows[cycle[0]][0], "after", f"jobs wait for each other in a cycle: {' → '.join(cycle)}")
+
+
+def _check_order(rows: Mapping[str, tuple[int, Row]], doubts: _Errors) -> None:
+    """Ask about each due date before the jobs that must finish first can finish, by their releases and dwell times."""
+    after = {name: [each for each in row.after if each in rows] for name, (_, row) in rows.items()}
+    earliest_s, latest = dict[str, float](), dict[str, str]()  # finish, and the job whose release determines it
+    for name in TopologicalSorter(after).static_order():
+        number, row = rows[name]
+        last = max(after[name], key=lambda each: earliest_s[each], default=name)
+        waits_s = earliest_s.get(last, 0.0)
+        latest[name] = latest[last] if waits_s > row.release_s else name
+        earliest_s[name] = max(waits_s, row.release_s) + row.repetitions * row.dwell_s
+        if row.due_s is not None and row.due_s < waits_s:
+            first = rows[latest[last]][1]
+            work_s = waits_s - first.release_s
+            release, due = _given_time(first, "release_s"), _given_time(row, "due_s")
+            doubts.add(
+                number,
+                "due",
+                f"before it, '{printable(first.name)}' must finish, which has its release at {release}; that takes at "
+                f"least {work_s:.15g} s, so the job cannot be on time (got {due})",
+            )
 
 
 def cycle_of(after: Mapping[str, Sequence[str]]) -> list[str]:

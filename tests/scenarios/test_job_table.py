@@ -360,6 +360,31 @@ def test_hours_among_clock_times_are_asked_about(tmp_path, caplog):
     assert drawn(small_table(tmp_path, seconds, begin), 0)[0].release_s == 23.5
 
 
+def test_a_due_date_before_the_jobs_that_must_finish_first_is_told(tmp_path, caplog):
+    begin = "shift_begin = 2026-11-23T22:00:00+01:00\nhorizon_s = 36000"
+    rows = "a1,hold,bench,,3,5:00,5:30,,,,20\na2,hold,bench,,,22:30,{},,,a1,\na3,hold,bench,,,,{},,,a2,"
+    sentence = "before it, 'a1' must finish, which has its release at 5:00; that takes at least "
+    short = SMALL.replace("horizon_s = 180", "")
+    for second, third, told in (
+        (
+            "23:40",
+            "5:00:30",
+            f"row 3, column due: {sentence}60 s, so the job cannot be on time (got 23:40).",
+        ),
+        (
+            "5:40",
+            "5:01",
+            f"row 4, column due: {sentence}60.5 s, so the job cannot be on time (got 5:01).",
+        ),
+        ("5:01", "5:01:01", ""),
+    ):
+        caplog.clear()
+        (tmp_path / "jobs.csv").write_text(f"{SHORT},dwell\n{rows.format(second, third)}\n", encoding="utf-8")
+        with_table(tmp_path / "cell.toml", short, "jobs.csv", begin)
+        assert told in caplog.text
+        assert ("cannot be on time" in caplog.text) == bool(told)
+
+
 def test_light_payloads_in_grams_are_asked_about(tmp_path):
     for grams, refused in (("0.5", True), ("200", False)):
         path = tmp_path / "jobs.csv"
