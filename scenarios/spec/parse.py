@@ -76,6 +76,10 @@ def readable_error(error: msgspec.ValidationError, raw: object, schema: Any) -> 
         wanted = [_WORDS.get(name, name) for name in match[1].split(" | ") if name != "null"]
         return f"{lead}expected {' or '.join(wanted)}, got {_WORDS.get(match[2], match[2])}{_shown(value)}."
     if text.startswith("Invalid enum value"):
+        if place.endswith(".unit"):  # the most similar unit has another length
+            return (
+                f"{lead}'{value}' is not allowed. Allowed: {', '.join(get_args(kind))}. Export the file in one of them."
+            )
         return f"{lead}'{value}' is not allowed{nearest(str(value), get_args(kind))}"
     return f"{lead}{text[:1].lower()}{text[1:]}."
 
