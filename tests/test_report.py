@@ -523,6 +523,41 @@ def test_late_jobs_turn_the_badge_red_and_abandoned_ones_come_last() -> None:
     )
 
 
+def row_of_table(name: str, *after: str, kind: str = "sort") -> dict[str, Any]:
+    return {"name": name, "kind": kind, "places": [["a", "b"]], "payload_kg": [0.2], "after": list(after)}
+
+
+IN_ORDER = {"jobs": [row_of_table("A1"), row_of_table("A2", "A1")]}
+
+
+@pytest.mark.parametrize(
+    ("card", "finished_s", "reason"),
+    [
+        (IN_ORDER, 900.0, "it waited for A1, which finished at 0:15:00"),
+        (IN_ORDER, None, "it waits for A1, which is not finished (waiting)"),
+        (IN_ORDER, 300.0, "arm_a was idle: the job's place was taken, or the policy let the job wait"),
+        ({"jobs": [row_of_table("A1"), row_of_table("A2")], "slots": 1}, None,
+         "arm_a was idle: the job's place was taken, or the policy let the job wait, or it had no slot "
+         "(1 for up to 2 waiting jobs)"),
+        ({"jobs": [row_of_table("A1"), row_of_table("A2", kind="pick_place")]}, 300.0,
+         "it was never awarded, and no offer for it or for a job with the same work is recorded"),
+        ({}, 300.0, "it was never awarded, and no offer for it or for a job with the same work is recorded"),
+    ],
+)  # fmt: skip
+def test_a_row_of_a_table_that_was_never_awarded_has_a_reason(card, finished_s: float | None, reason: str) -> None:
+    first = replace(record("A1", 2000.0, "waiting" if finished_s is None else "finished"), finished_s=finished_s)
+    readings = telemetry(1000)
+    log = replace(
+        log_of(
+            replace(readings, temp_c=np.full(readings.temp_c.shape, 30.0)), ("arm_a", "arm_b"), (), {"scenario": card}
+        ),
+        jobs=(first, record("A2", 500.0, "waiting")),
+        offers=(offered("A1", 10.0, 100.0),),
+    )
+    (late,) = late_jobs(log)
+    assert lateness_text(log, [late]) == f"A2 is unfinished 8 min 20 s after its due date: {reason}."
+
+
 def test_a_job_that_was_due_before_its_release_and_never_taken_has_no_time_of_work() -> None:
     events = (event(300.0, "release", job="open-1"), event(1000.0, "warning", job=""))
     jobs = (replace(record("open-1", 60.0, "waiting"), release_s=300.0),)

@@ -301,11 +301,15 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
         wait_s = late.due_s - begin_s
         due = f"{duration(abs(wait_s))} {'after' if wait_s >= 0 else 'before'} its release"
         return f"its work takes {duration(took_s)}, and it was due {due}" if own else f"it was due {due}"
-    offers = [offer for offer in log.offers if offer.job == late.job]
-    offers = offers or [offer for offer in log.offers if stream_of(offer.job) == stream_of(late.job)]
-    able = [arm for arm in log.arms if any(offer.feasible and offer.arm == arm for offer in offers)]
+    last, ready_s = log.last_before.get(late.job, (log.records[late.job], -math.inf))
+    if ready_s > late.due_s or ready_s - begin_s > (end_s - begin_s) / 2:
+        if math.isfinite(ready_s):
+            return f"it waited for {last.job}, which finished at {clock(ready_s, log.begin)}"
+        return f"it waits for {last.job}, which is not finished ({last.state.replace('_', ' ')})"
+    begin_s = max(begin_s, ready_s)
+    able = _able(log, _offers_like(log, late.job))
     if not able:
-        return "it was never awarded, and no offer for it is recorded"
+        return "it was never awarded, and no offer for it or for a job with the same work is recorded"
     halts = {_halt(log, halt): halt for halt in log.halts if halt.start_s < late.due_s}
     waits_s = _arm_time(log, able, begin_s, end_s, halts)
     if all(each.start_s >= late.due_s for each in log.plan.breaks):
@@ -320,6 +324,23 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
         return most
     be = "" if most == PAUSED else "were " if len(arms) > 1 else "was "
     return f"{names_text(arms)} {be}{most}"
+
+
+def _able(log: ShiftLog, offers: Sequence[Offer]) -> list[str]:
+    """Arms that can do the job of some offers."""
+    return [arm for arm in log.arms if any(offer.feasible and offer.arm == arm for offer in offers)]
+
+
+def _offers_like(log: ShiftLog, job: str) -> list[Offer]:
+    """Offers for a job, else for jobs of its stream, else for jobs with the same work."""
+    offers = [offer for offer in log.offers if offer.job == job]
+    offers = offers or [offer for offer in log.offers if stream_of(offer.job) == stream_of(job)]
+    if not offers and (stream := log.stream(job)):
+        names = ("kind", "places", "payload_kg", "dwell_s", "force_n")
+        streams = log.streams.values()
+        alike = {each["name"] for each in streams if all(each.get(name) == stream.get(name) for name in names)}
+        offers = [offer for offer in log.offers if {offer.job, stream_of(offer.job)} & alike]
+    return offers
 
 
 def _absence_in(span: JobSpan, event: Event) -> bool:
@@ -344,7 +365,7 @@ def _return_reason(log: ShiftLog, span: JobSpan) -> str:
 def _passed(log: ShiftLog, late: LateJob, able: Sequence[str], begin_s: float, end_s: float) -> str:
     """How many jobs were awarded before a late one to arms that can do it, and what most of them have in common."""
     ahead = [s for s in log.plan.assignments if s.arm in able and begin_s <= s.start_s < end_s and s.job != late.job]
-    records = {record.job: record for record in log.jobs}
+    records = log.records
     took_s = {(o.arm, o.job, o.time_s): o.duration_s for o in log.offers if o.duration_s}
     like = [s for (_, job, _), s in took_s.items() if job == late.job]
     own = records.get(late.job)
@@ -372,8 +393,12 @@ def _arm_time(
 ) -> dict[str, dict[str, float]]:
     """Time of each arm that can do a job between its release and its award, s, by what the arm did, or by what kept it
     from getting jobs; "": later jobs."""
+    slots = int(log.card.get("scenario", {}).get("slots", 0))
+    waiting = _most_waiting(log, begin_s, end_s)
     earlier, out, failed = "at work since before its release", "out after a fault", "out after a failure"
     hot, idle = "idle above the warning limit", "idle: the job's place was taken, or the policy let the job wait"
+    if 0 < slots < waiting:  # which jobs had the slots is not recorded
+        idle = f"{idle}, or it had no slot ({slots} for up to {waiting} waiting jobs)"
     absent = "absent, or no state was recorded"
     whys = (*halts, "", earlier, out, failed, PAUSED, hot, idle, absent)
     time_s = {why: dict.fromkeys(able, 0.0) for why in whys}
@@ -394,6 +419,21 @@ def _arm_time(
         time_s[absent][arm] += step_s * float(np.isneginf(peak_c).sum())
         time_s[idle][arm] += step_s * float((np.isfinite(peak_c) & (peak_c < log.limits.warning_c)).sum())
     return time_s
+
+
+def _most_waiting(log: ShiftLog, begin_s: float, end_s: float) -> int:
+    """Largest number of jobs that waited for nothing but an arm at one time, by their first awards."""
+    ends_s = dict[str, float]()
+    for event in sorted(log.events, key=lambda event: event.time_s):
+        if event.kind in ("award", "expire", "give_up", "cancel"):
+            ends_s.setdefault(event.job, event.time_s)
+    changes = [(log.ready_s(record), 1) for record in log.jobs if log.ready_s(record) < end_s]
+    changes += [(ends_s[record.job], -1) for record in log.jobs if ends_s.get(record.job, math.inf) < end_s]
+    count = most = 0
+    for time_s, change in sorted(changes):
+        count += change
+        most = max(most, count) if time_s >= begin_s else count
+    return most
 
 
 def _common_s(begin_s: float, end_s: float, *spans: JobSpan | Outage | Halt) -> float:
