@@ -515,7 +515,7 @@ def test_late_jobs_turn_the_badge_red_and_abandoned_ones_come_last() -> None:
         event(0.0, "release", job="open-1"), event(1000.0, "warning", job="")))  # fmt: skip
     assert lateness_text(unread, late_jobs(unread)[:1]).endswith("what arm_a did meanwhile is not recorded.")
     told = verdict(log)
-    assert (told.badge, told.good) == ("3 late jobs", False)
+    assert (told.badge, told.good) == ("3 late jobs, 1 job left waiting beside idle arms", False)
     assert [late.job for late in late_jobs(log)] == ["open-1", "long-1", "gone-1"]
     assert told.moments[told.sentences[-1]].time_s == 500.0
     assert lateness_text(log, late_jobs(log)[1:2]) == (
@@ -556,6 +556,35 @@ def test_a_row_of_a_table_that_was_never_awarded_has_a_reason(card, finished_s: 
     )
     (late,) = late_jobs(log)
     assert lateness_text(log, [late]) == f"A2 is unfinished 8 min 20 s after its due date: {reason}."
+
+
+@pytest.mark.parametrize(
+    ("done_s", "state", "able", "status", "stands"),
+    [
+        (100.0, "waiting", True, "finished", True),
+        (200.0, "waiting", True, "finished", False),
+        (100.0, "expired", True, "finished", False),
+        (100.0, "waiting", False, "finished", False),
+        (100.0, "waiting", True, "interrupted", False),
+    ],
+    ids=["at a standstill", "not for long", "no job waits", "no arm can do it", "not to the end"],
+)
+def test_a_fleet_at_a_standstill_is_told(done_s: float, state: str, able: bool, status: str, stands: bool) -> None:
+    offers = (replace(offered("open-1", 50.0, 9.0), feasible=able), replace(offered("done-1", 0.0, 9.0), arm="arm_b"))
+    unable = replace(offers[0], arm="arm_b", feasible=False)
+    log = replace(
+        log_of(telemetry(1000), ("arm_a", "arm_b"), done("done-1", 0.0, done_s), {"status": status}),
+        jobs=(record("done-1", 840.0), record("open-1", 5000.0, state)),
+        offers=(*offers, unable),
+    )
+    told = verdict(log)
+    sentence = (
+        "1 job still waited at the end, though arm_a was idle from 0:01:40 to the end: see why jobs are late in the "
+        "report, and run another policy."
+    )
+    assert (sentence in told.sentences) == stands
+    assert ("1 job left waiting beside idle arms" in told.badge) == stands
+    assert told.good == (status == "finished" and not stands)
 
 
 def test_a_job_that_was_due_before_its_release_and_never_taken_has_no_time_of_work() -> None:

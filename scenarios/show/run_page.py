@@ -20,6 +20,8 @@ from scenarios.show.timeline import STREAM_NAME, hottest_motors, shift_charts, s
 from scenarios.show.words import clock, duration, kind_text, names_text, offer_text, offers_text, value_text
 from scenarios.table import Column, Moment, Table, render
 
+IDLE_S = 900.0
+"""Time for which an arm without a job, beside a job that it can do, is worth a sentence."""
 MOST_FAULTS = 2
 """Faults described in a sentence each."""
 MARGIN_K = 3.0
@@ -71,6 +73,8 @@ def verdict(log: ShiftLog) -> Verdict:
             f"Arms touched something {f'{contacts} times' if contacts > 1 else 'once'}: see the events below."
         )
     sentences += [f"{_halt(log, halt)}: no job was awarded." for halt in log.halts if not halt.arm]
+    if stood := standstill(log):
+        sentences.append(standstill_text(log, stood))
     if late := late_jobs(log):
         sentences.append(lateness_text(log, late))
         moments[sentences[-1]] = Moment(late[0].due_s)
@@ -83,9 +87,11 @@ def verdict(log: ShiftLog) -> Verdict:
         counts = ((len(faults), "fault"), (contacts, "contact"), (len(late), "late job"))
         badge = ", ".join(f"{count} {what}{'s' * (count > 1)}" for count, what in counts if count)
         calm = "No fault, no job" if metrics.get("jobs") == 0 else "No fault, no late job"
+        waited = [f"{stood.count} left waiting beside idle arms"] if stood else []
+        badge = ", ".join([*filter(None, [badge]), *waited])
         badge = badge or (calm if status == "finished" else f"Status: {status}")
     badge = f"{badge}; {log.unknown}" if log.unknown else badge
-    good = status == "finished" and not (faults or contacts or late or log.unknown)
+    good = status == "finished" and not (faults or contacts or late or stood or log.unknown)
     return Verdict(badge=badge, good=good, sentences=tuple(sentences), moments=moments)
 
 
@@ -214,6 +220,55 @@ def _occupied(offer: Offer, log: ShiftLog) -> str:
     if current.end_s >= plan.horizon_s:
         return "which was busy to the end"
     return f"once it was free, at {clock(current.end_s, log.begin)}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Standstill:
+    """Jobs that waited at the end of a shift beside arms that had long been idle."""
+
+    jobs: tuple[str, ...]
+    """Those that waited for no other job."""
+    arms: tuple[str, ...]
+    since_s: float
+    """From then on all of these arms were idle, and each could do one of the jobs, as far as is recorded."""
+
+    @property
+    def count(self) -> str:
+        """Number of the jobs, in words."""
+        return f"{len(self.jobs)} job{'s' * (len(self.jobs) > 1)}"
+
+
+def standstill(log: ShiftLog) -> Standstill | None:
+    """The standstill at the end of a finished shift; None if there was none, or for less than `IDLE_S`."""
+    if log.card.get("status") != "finished":
+        return None
+    end_s = min(log.plan.horizon_s, log.ended_s)
+    spans = (*log.plan.assignments, *log.plan.outages, *log.plan.breaks)
+    idle_s = {arm: max((span.end_s for span in spans if span.arm == arm), default=0.0) for arm in log.arms}
+    for halt in log.halts:
+        idle_s |= {arm: max(idle_s[arm], halt.end_s) for arm in log.arms if halt.arm in ("", arm)}
+    ready_s = {job.job: log.ready_s(job) for job in log.jobs if job.state == "waiting"}
+    jobs, since_s = set[str](), dict[str, float]()
+    for job, job_s in ready_s.items():
+        offers = _offers_like(log, job)
+        for arm in _able(log, offers) if offers else log.arms:
+            both_s = max(job_s, idle_s[arm])
+            if end_s - both_s >= IDLE_S:
+                jobs.add(job)
+                since_s[arm] = min(both_s, since_s.get(arm, math.inf))
+    if not jobs:
+        return None
+    arms = tuple(arm for arm in log.arms if arm in since_s)
+    return Standstill(jobs=tuple(sorted(jobs)), arms=arms, since_s=max(since_s.values()))
+
+
+def standstill_text(log: ShiftLog, stood: Standstill) -> str:
+    """How many jobs waited beside which arms since when, and what to look at."""
+    be = "were" if len(stood.arms) > 1 else "was"
+    return (
+        f"{stood.count} still waited at the end, though {names_text(stood.arms)} {be} idle from "
+        f"{clock(stood.since_s, log.begin)} to the end: see why jobs are late in the report, and run another policy."
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
