@@ -615,6 +615,7 @@ def _check_after(rows: Mapping[str, tuple[int, Row]], errors: _Errors, *, closed
 def _check_order(rows: Mapping[str, tuple[int, Row]], doubts: _Errors) -> None:
     """Ask about each due date before the jobs that must finish first can finish, by their releases and dwell times."""
     after = {name: [each for each in row.after if each in rows] for name, (_, row) in rows.items()}
+    sentences = dict[int, str]()
     earliest_s, latest = dict[str, float](), dict[str, str]()  # finish, and the job whose release determines it
     for name in TopologicalSorter(after).static_order():
         number, row = rows[name]
@@ -626,12 +627,13 @@ def _check_order(rows: Mapping[str, tuple[int, Row]], doubts: _Errors) -> None:
             first = rows[latest[last]][1]
             work_s = waits_s - first.release_s
             release, due = _given_time(first, "release_s"), _given_time(row, "due_s")
-            doubts.add(
-                number,
-                "due",
+            sentences[number] = (
                 f"before it, '{printable(first.name)}' must finish, which has its release at {release}; that takes at "
-                f"least {work_s:.15g} s, so the job cannot be on time (got {due})",
+                f"least {work_s:.15g} s, so the job cannot be on time (got {due})"
             )
+    for i, number in enumerate(sorted(sentences)):
+        rest = "the jobs in column after cannot finish before it, either"
+        doubts.add(number, "due", sentences[number] if i < MOST_NUMBERS else rest)
 
 
 def cycle_of(after: Mapping[str, Sequence[str]]) -> list[str]:

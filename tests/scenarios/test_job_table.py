@@ -383,6 +383,14 @@ def test_a_due_date_before_the_jobs_that_must_finish_first_is_told(tmp_path, cap
         with_table(tmp_path / "cell.toml", short, "jobs.csv", begin)
         assert told in caplog.text
         assert ("cannot be on time" in caplog.text) == bool(told)
+    many = [f"b{i},hold,bench,,,,22:{i + 10},,,a1," for i in range(12)]
+    table = "\n".join([f"{SHORT},dwell", *many, "a1,hold,bench,,3,5:00,5:30,,,,20"])
+    caplog.clear()
+    (tmp_path / "jobs.csv").write_text(table, encoding="utf-8")
+    with_table(tmp_path / "cell.toml", short, "jobs.csv", begin)
+    assert caplog.text.count("so the job cannot be on time") == 5
+    rest = "rows 7, 8, 9, 10, 11 and 2 more, column due: the jobs in column after cannot finish before it, either."
+    assert rest in caplog.text
 
 
 def test_light_payloads_in_grams_are_asked_about(tmp_path):
