@@ -185,8 +185,8 @@ class Fixture:
     """Roll, pitch, yaw about the fixed world axes x, y, z, deg."""
     mesh: str | None = None
     """File of a scenario file's fixture, relative to it: STL, OBJ, GLB, MJCF or URDF. It becomes a `surface`."""
-    unit: Literal["m", "mm"] = "m"
-    """Of the coordinates in that file."""
+    unit: Literal["m", "mm", "cm", "in"] = "m"
+    """Of the coordinates in that file; in: inch."""
     surface: Surface | None = None
     """Of a file that has been read, about the centre of the box around it."""
 

@@ -515,12 +515,76 @@ def test_late_jobs_turn_the_badge_red_and_abandoned_ones_come_last() -> None:
         event(0.0, "release", job="open-1"), event(1000.0, "warning", job="")))  # fmt: skip
     assert lateness_text(unread, late_jobs(unread)[:1]).endswith("what arm_a did meanwhile is not recorded.")
     told = verdict(log)
-    assert (told.badge, told.good) == ("3 late jobs", False)
+    assert (told.badge, told.good) == ("3 late jobs, 1 job left waiting beside idle arms", False)
     assert [late.job for late in late_jobs(log)] == ["open-1", "long-1", "gone-1"]
     assert told.moments[told.sentences[-1]].time_s == 500.0
     assert lateness_text(log, late_jobs(log)[1:2]) == (
         "long-1 finished 1 min late: its work takes 15 min, and it was due 14 min after its release."
     )
+
+
+def row_of_table(name: str, *after: str, kind: str = "sort") -> dict[str, Any]:
+    return {"name": name, "kind": kind, "places": [["a", "b"]], "payload_kg": [0.2], "after": list(after)}
+
+
+IN_ORDER = {"jobs": [row_of_table("A1"), row_of_table("A2", "A1")]}
+
+
+@pytest.mark.parametrize(
+    ("card", "finished_s", "reason"),
+    [
+        (IN_ORDER, 900.0, "it waited for A1, which finished at 0:15:00"),
+        (IN_ORDER, None, "it waits for A1, which is not finished (waiting)"),
+        (IN_ORDER, 300.0, "arm_a was idle: the job's place was taken, or the policy let the job wait"),
+        ({"jobs": [row_of_table("A1"), row_of_table("A2")], "slots": 1}, None,
+         "arm_a was idle: the job's place was taken, or the policy let the job wait, or it had no slot "
+         "(1 for up to 2 waiting jobs)"),
+        ({"jobs": [row_of_table("A1"), row_of_table("A2", kind="pick_place")]}, 300.0,
+         "it was never awarded, and no offer for it or for a job with the same work is recorded"),
+        ({}, 300.0, "it was never awarded, and no offer for it or for a job with the same work is recorded"),
+    ],
+)  # fmt: skip
+def test_a_row_of_a_table_that_was_never_awarded_has_a_reason(card, finished_s: float | None, reason: str) -> None:
+    first = replace(record("A1", 2000.0, "waiting" if finished_s is None else "finished"), finished_s=finished_s)
+    readings = telemetry(1000)
+    log = replace(
+        log_of(
+            replace(readings, temp_c=np.full(readings.temp_c.shape, 30.0)), ("arm_a", "arm_b"), (), {"scenario": card}
+        ),
+        jobs=(first, record("A2", 500.0, "waiting")),
+        offers=(offered("A1", 10.0, 100.0),),
+    )
+    (late,) = late_jobs(log)
+    assert lateness_text(log, [late]) == f"A2 is unfinished 8 min 20 s after its due date: {reason}."
+
+
+@pytest.mark.parametrize(
+    ("done_s", "state", "able", "status", "stands"),
+    [
+        (100.0, "waiting", True, "finished", True),
+        (200.0, "waiting", True, "finished", False),
+        (100.0, "expired", True, "finished", False),
+        (100.0, "waiting", False, "finished", False),
+        (100.0, "waiting", True, "interrupted", False),
+    ],
+    ids=["at a standstill", "not for long", "no job waits", "no arm can do it", "not to the end"],
+)
+def test_a_fleet_at_a_standstill_is_told(done_s: float, state: str, able: bool, status: str, stands: bool) -> None:
+    offers = (replace(offered("open-1", 50.0, 9.0), feasible=able), replace(offered("done-1", 0.0, 9.0), arm="arm_b"))
+    unable = replace(offers[0], arm="arm_b", feasible=False)
+    log = replace(
+        log_of(telemetry(1000), ("arm_a", "arm_b"), done("done-1", 0.0, done_s), {"status": status}),
+        jobs=(record("done-1", 840.0), record("open-1", 5000.0, state)),
+        offers=(*offers, unable),
+    )
+    told = verdict(log)
+    sentence = (
+        "1 job still waited at the end, though arm_a was idle from 0:01:40 to the end: see why jobs are late in the "
+        "report, and run another policy."
+    )
+    assert (sentence in told.sentences) == stands
+    assert ("1 job left waiting beside idle arms" in told.badge) == stands
+    assert told.good == (status == "finished" and not stands)
 
 
 def test_a_job_that_was_due_before_its_release_and_never_taken_has_no_time_of_work() -> None:

@@ -58,7 +58,7 @@ def run_command(
     from scenarios.policy_loader import blaming, label, policy_of
     from scenarios.result_folder import check_free
     from scenarios.run.log import RUN
-    from scenarios.show.run_page import figure_table
+    from scenarios.show.run_page import figure_table, standstill, standstill_text
     from scenarios.spec.jobs import check_some_jobs
     from scenarios.spec.load import load, own_seed
 
@@ -92,6 +92,8 @@ def run_command(
             say(f"The policy chose {result.metrics.illegal_actions} illegal actions; each counted as a wait.")
         if result.finished:
             say(f"Recorded in {where}; open {where / 'report.html'} in a browser.", out_console)
+    if stood := standstill(result):
+        say(standstill_text(result, stood))
     if not result.finished:
         say(
             f"Interrupted after {result.time_s:g} s of {chosen.horizon_s:g} s: the shift until then is kept in {where} "

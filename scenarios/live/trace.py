@@ -15,6 +15,7 @@ from scenarios.live.recording import CARD, read_parts
 from scenarios.live.recording_report import open_recording
 from scenarios.run.log import open_run
 from scenarios.run.records import Offer, ShiftLog
+from scenarios.show.run_page import late_jobs, lateness_text
 from scenarios.show.words import clock, offer_text, value_text
 from scenarios.table import Table
 
@@ -65,7 +66,7 @@ def thread_of(folder: Path, asked: str) -> Thread:
             If several events fit, the first one.
 
     Raises:
-        FleetError: no run or recording, or no such event.
+        FleetError: no run or recording, no such event, or a job that was never awarded.
     """
     log: ShiftLog
     results: Sequence[Mapping[str, Any]] = ()
@@ -79,6 +80,10 @@ def thread_of(folder: Path, asked: str) -> Thread:
         jobs = _recorded_jobs(results)
     else:
         raise FleetError(f"'{folder}' is neither a folder of `thermofleet run` nor of `thermofleet bus record`.")
+    job = asked.removeprefix("award@")
+    awarded = {event.job for event in events if event.kind == "award"}
+    if job in jobs and job not in awarded and not asked.isdecimal():
+        raise FleetError(_never_awarded(log, job, str(jobs[job]["state"]), events))
     rows = rows_of(events, asked, {notice.kind for notice in log.notices})
     event = events[rows[0]]
     work = log.plan.at(event.arm, event.time_s)
@@ -103,6 +108,15 @@ def thread_of(folder: Path, asked: str) -> Thread:
         configuration=scenario | {name: log.card.get(name, NOT_RECORDED) for name in CONFIGURATION},
         code={"hash": log.card.get("code_hash", NOT_RECORDED)} | log.card.get("versions", {}),
     )
+
+
+def _never_awarded(log: ShiftLog, job: str, state: str, events: Sequence[Event]) -> str:
+    """That a job was never awarded, why it is late, and its events."""
+    late = [each for each in late_jobs(log) if each.job == job]
+    why = f" {lateness_text(log, late)}" if late else ""
+    kinds = dict.fromkeys(event.kind for event in events if event.job == job)
+    listed = f" Trace another event: {', '.join(f'{kind}@{job}' for kind in kinds)}." if kinds else ""
+    return f"'{job}' was never awarded; its state is {state.replace('_', ' ')}.{why}{listed}"
 
 
 def _recorded_jobs(results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:

@@ -221,7 +221,10 @@ def cell_problems(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) 
 
 
 def unfinishable_jobs(scenario: Scenario, arms: Sequence[PlannedArm]) -> Iterator[str]:
-    """A sentence for each stream whose jobs cannot finish before they are due, or in the shift."""
+    """A sentence for each stream whose jobs cannot finish before they are due, or in the shift.
+
+    A table with whole minutes probably has them as h:mm, so there is no question about their unit.
+    """
 
     @cache
     def least_s(works: tuple[Work, ...], cycles: int) -> float:
@@ -239,6 +242,8 @@ def unfinishable_jobs(scenario: Scenario, arms: Sequence[PlannedArm]) -> Iterato
             continue
         left_s = max(left_s, 0.0)
         unit = next((name for name, s in (("minutes", 60.0), ("hours", 3600.0)) if s * left_s >= needed_s), "")
+        if stream.row and not any(time_s % 60.0 for time_s in (*(spec.times_s or ()), stream.due_s)):
+            unit = ""
         yield (
             f"{scenario.name}.toml: {place}: '{stream.name}' takes at least {needed_s:.4g} s ({cycles} "
             f"cycle{'s' * (cycles > 1)}), but has {left_s:.4g} s until {until}."

@@ -358,6 +358,38 @@ class ShiftLog:
         return schedule(self.events, self.arms, max(ends_s, default=horizon_s))
 
     @cached_property
+    def records(self) -> Mapping[str, JobRecord]:
+        """Jobs by name."""
+        return {record.job: record for record in self.jobs}
+
+    @cached_property
+    def streams(self) -> Mapping[str, Mapping[str, Any]]:
+        """Streams of the scenario by name; those that were recorded."""
+        return {stream["name"]: stream for stream in self.card.get("scenario", {}).get("jobs", ())}
+
+    def stream(self, job: str) -> Mapping[str, Any]:
+        """The stream of a job; empty if it is not recorded."""
+        return self.streams.get(job) or self.streams.get(job.rpartition("-")[0]) or {}
+
+    @cached_property
+    def last_before(self) -> Mapping[str, tuple[JobRecord, float]]:
+        """Of each job that waits for others the one that finishes last, and its finish, s: infinite if unfinished."""
+        last = dict[str, tuple[JobRecord, float]]()
+        for job in self.jobs:
+            number = job.job.rpartition("-")[2]
+            names = (name for each in self.stream(job.job).get("after", ()) for name in (each, f"{each}-{number}"))
+            before = [self.records[name] for name in names if name in self.records]
+            ends_s = [inf if each.finished_s is None else each.finished_s for each in before]
+            if before:
+                last[job.job] = max(zip(before, ends_s, strict=True), key=lambda each: each[1])
+        return last
+
+    def ready_s(self, job: JobRecord) -> float:
+        """Time from which a job waits for nothing but an arm; infinite if a job before it is unfinished."""
+        _, finished_s = self.last_before.get(job.job, (job, -inf))
+        return max(job.release_s, finished_s)
+
+    @cached_property
     def known_offers(self) -> tuple[Offer, ...]:
         """`offers`, with the state `break` or `paused` of an idle arm that had a break, or that people had paused."""
         spans = [*((each, "break") for each in self.plan.breaks), *((each, "paused") for each in self.halts)]

@@ -21,7 +21,7 @@ from scenarios.prepare.fleet import Fleet, ShiftFactory, cell_problems, prepare,
 from scenarios.prepare.load_factor import LoadFactor, load_factor
 from scenarios.progress import Progress, quiet
 from scenarios.show.words import clock, duration, names_text
-from scenarios.spec.calendar import begin_of, date_at
+from scenarios.spec.calendar import begin_of, date_at, moment_text
 from scenarios.spec.jobs import all_works, alternatives_of, fault_price, works_of
 from scenarios.spec.schema import ArmSpec, JobStream, Scenario
 from scenarios.table import Table
@@ -365,7 +365,7 @@ def _moment(scenario: Scenario, time_s: float) -> str:
     """A time of the shift; as a date where its begin is one."""
     if scenario.shift_begin is None:
         return clock(time_s)
-    return f"{date_at(begin_of(scenario.shift_begin, scenario.time_zone), time_s):%a %d %b %H:%M}"
+    return moment_text(date_at(begin_of(scenario.shift_begin, scenario.time_zone), time_s), "%a %d %b %H:%M")
 
 
 def _absences(scenario: Scenario) -> str:

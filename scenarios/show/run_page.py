@@ -20,6 +20,8 @@ from scenarios.show.timeline import STREAM_NAME, hottest_motors, shift_charts, s
 from scenarios.show.words import clock, duration, kind_text, names_text, offer_text, offers_text, value_text
 from scenarios.table import Column, Moment, Table, render
 
+IDLE_S = 900.0
+"""Time for which an arm without a job, beside a job that it can do, is worth a sentence."""
 MOST_FAULTS = 2
 """Faults described in a sentence each."""
 MARGIN_K = 3.0
@@ -71,6 +73,8 @@ def verdict(log: ShiftLog) -> Verdict:
             f"Arms touched something {f'{contacts} times' if contacts > 1 else 'once'}: see the events below."
         )
     sentences += [f"{_halt(log, halt)}: no job was awarded." for halt in log.halts if not halt.arm]
+    if stood := standstill(log):
+        sentences.append(standstill_text(log, stood))
     if late := late_jobs(log):
         sentences.append(lateness_text(log, late))
         moments[sentences[-1]] = Moment(late[0].due_s)
@@ -83,9 +87,11 @@ def verdict(log: ShiftLog) -> Verdict:
         counts = ((len(faults), "fault"), (contacts, "contact"), (len(late), "late job"))
         badge = ", ".join(f"{count} {what}{'s' * (count > 1)}" for count, what in counts if count)
         calm = "No fault, no job" if metrics.get("jobs") == 0 else "No fault, no late job"
+        waited = [f"{stood.count} left waiting beside idle arms"] if stood else []
+        badge = ", ".join([*filter(None, [badge]), *waited])
         badge = badge or (calm if status == "finished" else f"Status: {status}")
     badge = f"{badge}; {log.unknown}" if log.unknown else badge
-    good = status == "finished" and not (faults or contacts or late or log.unknown)
+    good = status == "finished" and not (faults or contacts or late or stood or log.unknown)
     return Verdict(badge=badge, good=good, sentences=tuple(sentences), moments=moments)
 
 
@@ -217,6 +223,55 @@ def _occupied(offer: Offer, log: ShiftLog) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Standstill:
+    """Jobs that waited at the end of a shift beside arms that had long been idle."""
+
+    jobs: tuple[str, ...]
+    """Those that waited for no other job."""
+    arms: tuple[str, ...]
+    since_s: float
+    """From then on all of these arms were idle, and each could do one of the jobs, as far as is recorded."""
+
+    @property
+    def count(self) -> str:
+        """Number of the jobs, in words."""
+        return f"{len(self.jobs)} job{'s' * (len(self.jobs) > 1)}"
+
+
+def standstill(log: ShiftLog) -> Standstill | None:
+    """The standstill at the end of a finished shift; None if there was none, or for less than `IDLE_S`."""
+    if log.card.get("status") != "finished":
+        return None
+    end_s = min(log.plan.horizon_s, log.ended_s)
+    spans = (*log.plan.assignments, *log.plan.outages, *log.plan.breaks)
+    idle_s = {arm: max((span.end_s for span in spans if span.arm == arm), default=0.0) for arm in log.arms}
+    for halt in log.halts:
+        idle_s |= {arm: max(idle_s[arm], halt.end_s) for arm in log.arms if halt.arm in ("", arm)}
+    ready_s = {job.job: log.ready_s(job) for job in log.jobs if job.state == "waiting"}
+    jobs, since_s = set[str](), dict[str, float]()
+    for job, job_s in ready_s.items():
+        offers = _offers_like(log, job)
+        for arm in _able(log, offers) if offers else log.arms:
+            both_s = max(job_s, idle_s[arm])
+            if end_s - both_s >= IDLE_S:
+                jobs.add(job)
+                since_s[arm] = min(both_s, since_s.get(arm, math.inf))
+    if not jobs:
+        return None
+    arms = tuple(arm for arm in log.arms if arm in since_s)
+    return Standstill(jobs=tuple(sorted(jobs)), arms=arms, since_s=max(since_s.values()))
+
+
+def standstill_text(log: ShiftLog, stood: Standstill) -> str:
+    """How many jobs waited beside which arms since when, and what to look at."""
+    be = "were" if len(stood.arms) > 1 else "was"
+    return (
+        f"{stood.count} still waited at the end, though {names_text(stood.arms)} {be} idle from "
+        f"{clock(stood.since_s, log.begin)} to the end: see why jobs are late in the report, and run another policy."
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class LateJob:
     """A job that passed its due date."""
 
@@ -301,11 +356,15 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
         wait_s = late.due_s - begin_s
         due = f"{duration(abs(wait_s))} {'after' if wait_s >= 0 else 'before'} its release"
         return f"its work takes {duration(took_s)}, and it was due {due}" if own else f"it was due {due}"
-    offers = [offer for offer in log.offers if offer.job == late.job]
-    offers = offers or [offer for offer in log.offers if stream_of(offer.job) == stream_of(late.job)]
-    able = [arm for arm in log.arms if any(offer.feasible and offer.arm == arm for offer in offers)]
+    last, ready_s = log.last_before.get(late.job, (log.records[late.job], -math.inf))
+    if ready_s > late.due_s or ready_s - begin_s > (end_s - begin_s) / 2:
+        if math.isfinite(ready_s):
+            return f"it waited for {last.job}, which finished at {clock(ready_s, log.begin)}"
+        return f"it waits for {last.job}, which is not finished ({last.state.replace('_', ' ')})"
+    begin_s = max(begin_s, ready_s)
+    able = _able(log, _offers_like(log, late.job))
     if not able:
-        return "it was never awarded, and no offer for it is recorded"
+        return "it was never awarded, and no offer for it or for a job with the same work is recorded"
     halts = {_halt(log, halt): halt for halt in log.halts if halt.start_s < late.due_s}
     waits_s = _arm_time(log, able, begin_s, end_s, halts)
     if all(each.start_s >= late.due_s for each in log.plan.breaks):
@@ -320,6 +379,23 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
         return most
     be = "" if most == PAUSED else "were " if len(arms) > 1 else "was "
     return f"{names_text(arms)} {be}{most}"
+
+
+def _able(log: ShiftLog, offers: Sequence[Offer]) -> list[str]:
+    """Arms that can do the job of some offers."""
+    return [arm for arm in log.arms if any(offer.feasible and offer.arm == arm for offer in offers)]
+
+
+def _offers_like(log: ShiftLog, job: str) -> list[Offer]:
+    """Offers for a job, else for jobs of its stream, else for jobs with the same work."""
+    offers = [offer for offer in log.offers if offer.job == job]
+    offers = offers or [offer for offer in log.offers if stream_of(offer.job) == stream_of(job)]
+    if not offers and (stream := log.stream(job)):
+        names = ("kind", "places", "payload_kg", "dwell_s", "force_n")
+        streams = log.streams.values()
+        alike = {each["name"] for each in streams if all(each.get(name) == stream.get(name) for name in names)}
+        offers = [offer for offer in log.offers if {offer.job, stream_of(offer.job)} & alike]
+    return offers
 
 
 def _absence_in(span: JobSpan, event: Event) -> bool:
@@ -344,7 +420,7 @@ def _return_reason(log: ShiftLog, span: JobSpan) -> str:
 def _passed(log: ShiftLog, late: LateJob, able: Sequence[str], begin_s: float, end_s: float) -> str:
     """How many jobs were awarded before a late one to arms that can do it, and what most of them have in common."""
     ahead = [s for s in log.plan.assignments if s.arm in able and begin_s <= s.start_s < end_s and s.job != late.job]
-    records = {record.job: record for record in log.jobs}
+    records = log.records
     took_s = {(o.arm, o.job, o.time_s): o.duration_s for o in log.offers if o.duration_s}
     like = [s for (_, job, _), s in took_s.items() if job == late.job]
     own = records.get(late.job)
@@ -372,8 +448,12 @@ def _arm_time(
 ) -> dict[str, dict[str, float]]:
     """Time of each arm that can do a job between its release and its award, s, by what the arm did, or by what kept it
     from getting jobs; "": later jobs."""
+    slots = int(log.card.get("scenario", {}).get("slots", 0))
+    waiting = _most_waiting(log, begin_s, end_s)
     earlier, out, failed = "at work since before its release", "out after a fault", "out after a failure"
     hot, idle = "idle above the warning limit", "idle: the job's place was taken, or the policy let the job wait"
+    if 0 < slots < waiting:  # which jobs had the slots is not recorded
+        idle = f"{idle}, or it had no slot ({slots} for up to {waiting} waiting jobs)"
     absent = "absent, or no state was recorded"
     whys = (*halts, "", earlier, out, failed, PAUSED, hot, idle, absent)
     time_s = {why: dict.fromkeys(able, 0.0) for why in whys}
@@ -394,6 +474,21 @@ def _arm_time(
         time_s[absent][arm] += step_s * float(np.isneginf(peak_c).sum())
         time_s[idle][arm] += step_s * float((np.isfinite(peak_c) & (peak_c < log.limits.warning_c)).sum())
     return time_s
+
+
+def _most_waiting(log: ShiftLog, begin_s: float, end_s: float) -> int:
+    """Largest number of jobs that waited for nothing but an arm at one time, by their first awards."""
+    ends_s = dict[str, float]()
+    for event in sorted(log.events, key=lambda event: event.time_s):
+        if event.kind in ("award", "expire", "give_up", "cancel"):
+            ends_s.setdefault(event.job, event.time_s)
+    changes = [(log.ready_s(record), 1) for record in log.jobs if log.ready_s(record) < end_s]
+    changes += [(ends_s[record.job], -1) for record in log.jobs if ends_s.get(record.job, math.inf) < end_s]
+    count = most = 0
+    for time_s, change in sorted(changes):
+        count += change
+        most = max(most, count) if time_s >= begin_s else count
+    return most
 
 
 def _common_s(begin_s: float, end_s: float, *spans: JobSpan | Outage | Halt) -> float:

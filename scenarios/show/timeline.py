@@ -15,6 +15,7 @@ from scenarios.show import charts
 from scenarios.show.charts import AXIS, FAULT, INK, WARNING, Trace, plain
 from scenarios.show.page import Chart
 from scenarios.show.words import clock, duration, event_text
+from scenarios.spec.calendar import moment_text
 
 Array = np.ndarray
 Span = TypeVar("Span", JobSpan, Outage)
@@ -295,7 +296,7 @@ def time_unit(horizon_s: float) -> tuple[str, float]:
 
 def _time_title(log: ShiftLog, unit: str) -> str:
     """Title of an axis of time, which counts from the begin of the shift."""
-    return f"time ({unit})" if log.begin is None else f"time since {log.begin:%a %d %b %H:%M} ({unit})"
+    return f"time ({unit})" if log.begin is None else f"time since {moment_text(log.begin, '%a %d %b %H:%M')} ({unit})"
 
 
 def _outages(outages: Sequence[Outage], arms: Sequence[str], unit_s: float) -> list[dict[str, Any]]:

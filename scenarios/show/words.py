@@ -5,7 +5,7 @@ from datetime import datetime
 from typing import TYPE_CHECKING
 
 from fleet.events import Event
-from scenarios.spec.calendar import date_at
+from scenarios.spec.calendar import date_at, moment_text
 
 if TYPE_CHECKING:  # slow to import
     from fleet.bus.protocol.auction import ArmEvent
@@ -28,9 +28,8 @@ def clock(time_s: float, begin: datetime | None = None) -> str:
     """
     if begin is not None:
         moment = date_at(begin, time_s)
-        twice = moment.replace(fold=0).utcoffset() != moment.replace(fold=1).utcoffset()
         day = "" if moment.date() == begin.date() else "%a %d %b "
-        return f"{moment:{day}%H:%M:%S{' %Z' if twice else ''}}"
+        return moment_text(moment, f"{day}%H:%M:%S")
     seconds = round(time_s)
     return f"{seconds // 3600}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
 

@@ -63,6 +63,11 @@ def date_at(begin: datetime, time_s: float) -> datetime:
     return (begin.astimezone(UTC) + timedelta(seconds=round(time_s))).astimezone(begin.tzinfo)
 
 
+def moment_text(moment: datetime, form: str) -> str:
+    """A date in a form for times of day; where clocks go back, the hour that occurs twice has the name of its zone."""
+    return f"{moment:{form}{' %Z' if twice(moment) else ''}}"
+
+
 def with_calendar(raw: Mapping[str, Any], begin: datetime | None, horizon_s: float, file: str) -> dict[str, Any]:
     """The parsed file with the times of its breaks and recurring jobs in seconds; Any: values of TOML.
 
@@ -244,7 +249,7 @@ def _span_text(scenario: Scenario, begin_s: float, end_s: float) -> str:
     if scenario.shift_begin is None:
         return f"{begin_s:g} to {end_s:g} s"
     begin = begin_of(scenario.shift_begin, scenario.time_zone)
-    return " to ".join(f"{date_at(begin, time_s):%d %b %Y %H:%M}" for time_s in (begin_s, end_s))
+    return " to ".join(moment_text(date_at(begin, time_s), "%d %b %Y %H:%M") for time_s in (begin_s, end_s))
 
 
 def absences_of(scenario: Scenario, seed: np.random.SeedSequence) -> np.ndarray:

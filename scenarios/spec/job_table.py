@@ -28,7 +28,7 @@ from fleet.bus.protocol.auction import Admission, JobSpec, JobStatus
 from fleet.errors import ScenarioError, check_names, nearest, printable
 from fleet.files import decode_text
 from fleet.job import BOUNDS, DWELL_S, KINDS, check_alternatives, check_bounds, check_duration, check_dwell
-from scenarios.spec.units import question
+from scenarios.spec.units import check_times, question
 
 _LOG = logging.getLogger(__name__)
 SUFFIXES = (".csv", ".tsv", ".parquet", ".xlsx")
@@ -48,9 +48,12 @@ MOST_SHEET_S = 7 * DAY_S
 """Of a shift without a known end: numbers of days further on are times in seconds."""
 DATE = "a date with time and zone, as 2026-11-23T06:00+01:00"
 _CLOCK = re.compile(r"(\d{1,4}):([0-5]\d)(?::([0-5]\d(?:[.,]\d+)?))?")
-_ARROW, _OR = re.compile(r"->|→|>"), re.compile(r"[|;,]")
+_ARROW, _SEPARATOR = re.compile(r"->|→|>"), re.compile("[;,]")
+"""Between from and to; and what may be in a name, but is often written instead of `|`."""
 _DOTTED_CLOCK = re.compile(r"([01]?\d|2[0-3])[.,]([0-5]\d)")
 """A time of day as it is written in German; seconds have one decimal or none, as a decision takes them."""
+_HOURS = re.compile(r"([1-9]|1\d|2[0-3])(?:[.,](\d))?")
+"""A number that is a time of day, in hours or in German, if the other times of a table have minutes."""
 _MILITARY_CLOCK = re.compile(r"(0\d)([0-5]\d)")
 _THOUSANDS = re.compile(r"[1-9]\d{0,2}(\.\d{3})+")
 _GERMAN_DATE = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4}) +(\d{1,2}:\d{2}.*)")
@@ -68,7 +71,10 @@ Rows = Iterator[tuple[int, Sequence[Cell]]]
 
 
 class Row(SimpleNamespace):
-    """Values of one row by field of `JobSpec`; the default where a cell is empty or wrong."""
+    """Values of one row by field of `JobSpec`; the default where a cell is empty or wrong.
+
+    `texts` has the cells of its times as texts, by field.
+    """
 
 
 class _Dialect(NamedTuple):
@@ -80,6 +86,8 @@ class _Dialect(NamedTuple):
     """Length of the shift; inf for unknown."""
     day_fractions: bool
     """Whether a number below 1 may be a time of day, as in a sheet."""
+    names: Collection[str] = ()
+    """Of all jobs of the table."""
     factor: float = 1.0
     """Of a plain number, to s or kg."""
     tell: Callable[[str], None] = _LOG.warning
@@ -109,17 +117,18 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
     if isinstance(cell, timedelta):
         return cell.total_seconds()
     if dialect.day_fractions and isinstance(cell, float) and 0.0 < cell < 1.0:
-        clock_time = f"{datetime.min + timedelta(days=cell):%H:%M}"
+        hours, minutes = divmod(round(cell * DAY_S) // 60, 60)
+        clock_time = f"{hours:02d}:{minutes:02d}"
         raise ValueError(
             f"is this {clock_time}? Give its cell a format of time, or a number as a text (got {_shown(cell)})"
         )
-    text, begin = _text(cell.isoformat() if isinstance(cell, time | datetime) else cell), dialect.begin
+    text, begin = _time_text(cell), dialect.begin
     if clock := _CLOCK.fullmatch(text):
         hours, minutes, seconds = (float((part or "0").replace(",", ".")) for part in clock.groups())
         given_s = 3600 * hours + 60 * minutes + seconds
         return given_s if begin is None else _clock_seconds(text, given_s, begin, dialect)
     if isinstance(cell, str) and (dotted := _DOTTED_CLOCK.fullmatch(text)):
-        number = f"{float(text.replace(',', '.')):.3f}"
+        number = _three_decimals(text, dialect)
         raise ValueError(f"is this {dotted[1]}:{dotted[2]}? Give times as h:mm, or a number as {number}")
     if isinstance(cell, str) and (clock := _MILITARY_CLOCK.fullmatch(text)):
         raise ValueError(f"is this {clock[1]}:{clock[2]}? Give times as h:mm, or a number as {int(text)}")
@@ -133,6 +142,12 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
             f"{moment:%Y-%m-%dT%H:%M} (got {_shown(cell)})"
         )
     return number
+
+
+def _three_decimals(text: str, dialect: _Dialect) -> str:
+    """A number in a form that is no time of day, with the decimal sign of the table."""
+    number = f"{float(text.replace(',', '.')):.3f}"
+    return number.replace(".", ",") if dialect.decimal_comma else number
 
 
 def _clock_seconds(text: str, given_s: float, begin: datetime, dialect: _Dialect) -> float:
@@ -180,11 +195,11 @@ def _local_seconds(moment: datetime, given: str, begin: datetime, tell: Callable
 
 
 def _of_sheet(days: float, begin: datetime, horizon_s: float) -> datetime | None:
-    """The date that a spreadsheet stores as these days, if it is on a day of the shift, or on the one after it."""
+    """The date, to the second, that a spreadsheet stores as these days, if it is on a day of the shift or the next."""
     first = (begin.replace(tzinfo=None) - SHEET_ZERO).days
     if not first <= days < first + 2 + min(horizon_s, MOST_SHEET_S) // DAY_S:
         return None
-    return SHEET_ZERO + timedelta(days=days)
+    return SHEET_ZERO + timedelta(seconds=round(days * DAY_S))
 
 
 def check_exists(moment: datetime, given: str) -> None:
@@ -232,9 +247,18 @@ def seconds_of(given: object, begin: datetime | None, horizon_s: float, tell: Ca
     return _seconds(given, _Dialect(begin, False, horizon_s, False, tell=tell))
 
 
-def _names(cell: Cell, _: object) -> tuple[str, ...]:
-    parts = cell if isinstance(cell, list) else _OR.split(_text(cell))
+def _names(cell: Cell, dialect: _Dialect) -> tuple[str, ...]:
+    parts = cell if isinstance(cell, list) else _names_in(_text(cell), dialect.names)
     return tuple(_label(part) for part in parts if _text(part))
+
+
+def _names_in(text: str, known: Collection[str]) -> list[str]:
+    """Names with `|` between them; commas and semicolons separate, too, where that gives known names only."""
+    names = list[str]()
+    for part in [text] if text in known else text.split("|"):
+        name, several = part.strip(), [each.strip() for each in _SEPARATOR.split(part) if each.strip()]
+        names += several if name not in known and all(each in known for each in several) else [name]
+    return names
 
 
 def _label(cell: Cell, _: object = None) -> str:
@@ -270,6 +294,10 @@ def _flag(cell: Cell, _: object) -> bool:
 
 def _text(cell: Cell) -> str:
     return f"{cell:.15g}" if isinstance(cell, float) else str(cell).strip()
+
+
+def _time_text(cell: Cell) -> str:
+    return _text(cell.isoformat() if isinstance(cell, time | datetime) else cell)
 
 
 def _shown(cell: Cell) -> str:
@@ -348,7 +376,8 @@ def read_job_table(
         file: Its path, or the content of a CSV file.
         where: Name of the table in errors; by default the path.
         begin: Of the shift, with its zone; needed for dates.
-        horizon_s: Length of the shift; a time of day before its begin must be within it on the next day.
+        horizon_s: Length of the shift; a time of day before its begin must be within it on the next day, and some job
+            must be released in it.
         places: Of the cell; None: not checked.
         closed: Whether `after` must name rows of the table.
 
@@ -362,13 +391,15 @@ def read_job_table(
     head_row, head = next(lines, (1, ()))
     if len(head) > MOST_COLUMNS:
         raise ScenarioError(f"{where} has {len(head)} columns; a job table has at most {MOST_COLUMNS}.")
-    columns, dialect = _read_head(head_row, head, errors), _Dialect(begin, decimal_comma, horizon_s, is_sheet)
+    columns = _read_head(head_row, head, errors)
     errors.raise_any(where)
+    body = list(islice(lines, MOST_ROWS + 1))
+    if len(body) > MOST_ROWS:
+        raise ScenarioError(f"{where} has too many rows; a job table has at most {MOST_ROWS}.")
+    dialect = _Dialect(begin, decimal_comma, horizon_s, is_sheet, names=_names_of(body, columns))
     no_place = _no_place(places or ())
     rows: dict[str, tuple[int, Row]] = {}
-    for count, (number, cells) in enumerate(lines):
-        if count == MOST_ROWS:
-            raise ScenarioError(f"{where} has too many rows; a job table has at most {MOST_ROWS}.")
+    for number, cells in body:
         if len(cells) > len(head) and not all(map(_is_empty, cells[len(head) :])):
             errors.add(number, "", f"{len(cells)} cells, but the head has {len(head)}; quote cells with separators")
             continue
@@ -383,8 +414,10 @@ def read_job_table(
             errors.add(number, "name", f"'{row.name}' is the name of row {rows[row.name][0]}, too; names are unique")
         elif not wrong:
             fields = {**vars(row), "places": row.every_places[0], "alternatives": row.every_places[1:]}
-            jobs[number] = JobSpec(**{name: value for name, value in fields.items() if name != "every_places"})
+            jobs[number] = JobSpec(**{name: fields[name] for name in fields if name not in ("every_places", "texts")})
         rows.setdefault(row.name, (number, row))
+    plain = {column for i, (column, _) in columns.items() if _key_of(head[i]) == column}
+    _check_hours(rows.values(), plain, errors, doubts)
     heaviest_kg = max((row.payload_kg for _, row in rows.values()), default=0.0)
     if ("payload", GRAMS) in columns.values() and 0.0 < heaviest_kg < LIGHT_KG:
         errors.add(
@@ -392,11 +425,22 @@ def read_job_table(
         )
     _check_after(rows, errors, closed=closed)
     errors.raise_any(where)
+    _check_order({row.name: (number, row) for number, row in rows.values() if number in jobs}, doubts)
     for sentence in doubts.lines():
         _LOG.warning("%s,%s", where, sentence[1:])
     if not jobs:
         raise ScenarioError(f"{where} has no jobs; give a row of headings, then one row for each job.")
+    if isfinite(horizon_s):
+        times_s = {f"row {number}, '{job.name}',": job.release_s for number, job in jobs.items()}
+        numbers_s = [row.release_s for _, row in rows.values() if ":" not in row.texts.get("release_s", "")]
+        check_times([*times_s.values()], horizon_s, where, [*times_s], numbers_s)
     return jobs
+
+
+def _names_of(body: Sequence[tuple[int, Sequence[Cell]]], columns: Mapping[int, tuple[str, float]]) -> frozenset[str]:
+    """Names of all jobs of a table."""
+    (index,) = (i for i, (column, _) in columns.items() if column == "name")
+    return frozenset(_text(cells[index]) for _, cells in body if index < len(cells))
 
 
 def check_places(jobs: Mapping[int, JobSpec], places: Collection[str], where: str) -> None:
@@ -426,7 +470,7 @@ def _read_head(number: int, head: Sequence[Cell], errors: _Errors) -> dict[int, 
         text = "" if _is_empty(heading) else printable(str(heading).strip())
         if not text or text.startswith("#"):
             continue
-        key = re.sub(r"[^a-z]+", "_", text.lower()).strip("_")
+        key = _key_of(heading)
         column, factor = _SPELLINGS.get(key, ("", 1.0))
         stem, _, unit = key.rpartition("_")
         if not column and stem in _COLUMNS and _UNIT.fullmatch(unit):
@@ -445,6 +489,11 @@ def _read_head(number: int, head: Sequence[Cell], errors: _Errors) -> dict[int, 
     return columns
 
 
+def _key_of(heading: Cell) -> str:
+    """A heading in lower case, with an underscore for everything between its letters."""
+    return re.sub(r"[^a-z]+", "_", str(heading).lower()).strip("_")
+
+
 def _read_row(
     number: int,
     cells: Sequence[Cell],
@@ -454,7 +503,7 @@ def _read_row(
     doubts: _Errors,
 ) -> tuple[Row, set[str]]:
     """Values of a row, and the fields whose cells cannot be read."""
-    row, wrong = Row(**{field: default for field, _, default in _COLUMNS.values()}), set[str]()
+    row, wrong = Row(**{field: default for field, _, default in _COLUMNS.values()}, texts={}), set[str]()
     for i, (column, factor) in columns.items():
         cell = cells[i] if i < len(cells) else None
         field, convert, _ = _COLUMNS[column]
@@ -462,6 +511,8 @@ def _read_row(
             if not _is_empty(cell):
                 tell = partial(doubts.add, number, column)
                 setattr(row, field, convert(cell, dialect._replace(factor=factor, tell=tell)))
+                if convert is _job_time:
+                    row.texts[field] = _time_text(cell)
             elif column in _NEEDED:
                 raise ValueError("is empty; every job needs one")
         except ValueError as error:
@@ -496,9 +547,16 @@ def _problems(row: Row, wrong: Collection[str]) -> Iterator[tuple[str, str]]:
 
 def _check_due(row: Row) -> None:
     if row.due_s is not None and row.due_s < row.release_s:
-        raise ValueError(f"must not be before the release at {row.release_s:.15g} s (got {row.due_s:.15g} s)")
+        release, due = (_given_time(row, field) for field in ("release_s", "due_s"))
+        raise ValueError(f"must not be before the release at {release} (got {due})")
     if row.expires and row.due_s is None:
         raise ValueError("a hard due date needs a time")
+
+
+def _given_time(row: Row, field: str) -> str:
+    """A time of a row as it was given; a plain number in seconds."""
+    text = row.texts.get(field, "")
+    return printable(text, 60) if ":" in text else f"{getattr(row, field):.15g} s"
 
 
 def _check_force(row: Row) -> None:
@@ -521,13 +579,61 @@ def with_cell(answer: Answer, jobs: Mapping[str, tuple[str, JobSpec]]) -> Answer
     return replace(answer, reason=f"{place}: {answer.reason}")
 
 
+def _check_hours(rows: Collection[tuple[int, Row]], columns: Collection[str], errors: _Errors, doubts: _Errors) -> None:
+    """Check for numbers that are probably hours, in a table with other times as h:mm or dates.
+
+    Args:
+        columns: Those whose headings name no unit.
+        errors, doubts: Get numbers with and without a decimal.
+    """
+    if not any(":" in text for _, row in rows for text in row.texts.values()):
+        return
+    for number, row in rows:
+        for field, text in row.texts.items():
+            column, hours = _COLUMN_OF[field], _HOURS.fullmatch(text)
+            if hours is None or column not in columns:
+                continue
+            hour, tenth = hours[1], int(hours[2] or 0)
+            meant = f"{hour}:{6 * tenth:02d} or {hour}:{tenth}0" if tenth else f"{hour}:00"
+            advice = f"Give times as h:mm, or seconds in a column {column}_s"
+            if hours[2]:
+                errors.add(number, column, f"is this {meant}? {advice} (got {_shown(text)})")
+            else:
+                doubts.add(number, column, f"{_shown(text)} counts as {text} s; is this {meant}? {advice}")
+
+
 def _check_after(rows: Mapping[str, tuple[int, Row]], errors: _Errors, *, closed: bool) -> None:
     for number, row in rows.values() if closed else ():
         for name in row.after:
             if name not in rows:
-                errors.add(number, "after", f"there is no job '{printable(name)}' in this table")
+                hint = "; give | between names" if _SEPARATOR.search(name) else ""
+                errors.add(number, "after", f"there is no job '{printable(name)}' in this table{hint}")
     if cycle := cycle_of({name: row.after for name, (_, row) in rows.items()}):
         errors.add(rows[cycle[0]][0], "after", f"jobs wait for each other in a cycle: {' → '.join(cycle)}")
+
+
+def _check_order(rows: Mapping[str, tuple[int, Row]], doubts: _Errors) -> None:
+    """Ask about each due date before the jobs that must finish first can finish, by their releases and dwell times."""
+    after = {name: [each for each in row.after if each in rows] for name, (_, row) in rows.items()}
+    sentences = dict[int, str]()
+    earliest_s, latest = dict[str, float](), dict[str, str]()  # finish, and the job whose release determines it
+    for name in TopologicalSorter(after).static_order():
+        number, row = rows[name]
+        last = max(after[name], key=lambda each: earliest_s[each], default=name)
+        waits_s = earliest_s.get(last, 0.0)
+        latest[name] = latest[last] if waits_s > row.release_s else name
+        earliest_s[name] = max(waits_s, row.release_s) + row.repetitions * row.dwell_s
+        if row.due_s is not None and row.due_s < waits_s:
+            first = rows[latest[last]][1]
+            work_s = waits_s - first.release_s
+            release, due = _given_time(first, "release_s"), _given_time(row, "due_s")
+            sentences[number] = (
+                f"before it, '{printable(first.name)}' must finish, which has its release at {release}; that takes at "
+                f"least {work_s:.15g} s, so the job cannot be on time (got {due})"
+            )
+    for i, number in enumerate(sorted(sentences)):
+        rest = "the jobs in column after cannot finish before it, either"
+        doubts.add(number, "due", sentences[number] if i < MOST_NUMBERS else rest)
 
 
 def cycle_of(after: Mapping[str, Sequence[str]]) -> list[str]:

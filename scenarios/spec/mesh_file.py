@@ -13,7 +13,8 @@ from fleet.robot import rotation
 from fleet.surface import surface_of
 from scenarios.spec.schema import Scenario
 
-UNITS = {"m": 1.0, "mm": 0.001}
+UNITS = {"m": 1.0, "mm": 0.001, "cm": 0.01, "in": 0.0254}
+"""Metres of each unit, in the order in which a question names them."""
 MESHES, MODELS = (".stl", ".obj", ".glb"), (".xml", ".mjcf", ".urdf")
 MOST_BYTES, MOST_TRIANGLES, MOST_PARTS = 64_000_000, 100_000, 64
 MOST_LINE, MOST_HEAD = 10_000, 4_000_000

@@ -102,12 +102,19 @@ def _is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < MOST
 
 
-def check_times(times_s: Sequence[float], horizon_s: float, where: str, names: Sequence[str] = ()) -> None:
+def check_times(
+    times_s: Sequence[float],
+    horizon_s: float,
+    where: str,
+    names: Sequence[str] = (),
+    numbers_s: Sequence[float] | None = None,
+) -> None:
     """Log a warning if some arrival times lie outside the shift, or are probably in another unit.
 
     Args:
         where: Begins each sentence.
         names: Of the times, for the warning; may be left out.
+        numbers_s: Times that were given as numbers, which may be in another unit; by default all.
 
     Raises:
         ScenarioError: none lies in the shift.
@@ -117,7 +124,8 @@ def check_times(times_s: Sequence[float], horizon_s: float, where: str, names: S
         raise ScenarioError(f"{where} gives no job: there are no times. Give seconds from the begin of the shift.")
     if not horizon_s > 0:  # reported when the scenario is made
         return
-    question, last = _unit_of_times(times_s, horizon_s, FEWEST_ARRIVALS), max(times_s)
+    numbers_s = times_s if numbers_s is None else numbers_s
+    question, last = _unit_of_times(numbers_s, horizon_s, FEWEST_ARRIVALS) if numbers_s else "", max(times_s)
     if not inside:
         which = "its only time is" if count == 1 else f"all {count} times are"
         raise ScenarioError(
@@ -130,7 +138,8 @@ def check_times(times_s: Sequence[float], horizon_s: float, where: str, names: S
             *(where, count - inside, count, horizon_s, _first_outside(times_s, horizon_s, names), question),
         )
     elif question:
-        _LOG.warning("%s: all %d times are within %g s of a shift of %g s.%s", where, count, last, horizon_s, question)
+        within = f"all {len(numbers_s)} times are within {max(numbers_s):g} s of a shift of {horizon_s:g} s"
+        _LOG.warning("%s: %s.%s", where, within, question)
 
 
 def check_ambient(points: Sequence[tuple[float, float]], horizon_s: float, where: str) -> None:

@@ -31,6 +31,7 @@ from scenarios.spec.load import library, load
 from scenarios.spec.options import ENDPOINT, PORT, Budget, LiveSpec, RunSpec, Shot, StudySpec
 from scenarios.suite.instances import CELLS
 from tests.commands import REAL
+from tests.own_policies import IDLE
 from tests.scenarios.conftest import QUICK, run_json
 from twin.thermal.identify import AMBIENT_C
 
@@ -49,6 +50,22 @@ def test_a_run_prints_its_figures_and_leaves_four_files(thermofleet, small_toml,
         assert f"{peak_c:.1f}" in said.out
     assert str(out / "report.html") in said.out
     assert said.err == ""
+
+
+def test_a_run_of_a_fleet_that_stands_still_says_so(thermofleet, small_toml, tmp_path):
+    small_toml.write_text(
+        small_toml.read_text(encoding="utf-8").replace("horizon_s = 180", "horizon_s = 1800"), "utf-8"
+    )
+    policy = tmp_path / "idle.py"
+    policy.write_text(IDLE, encoding="utf-8")
+    options = ("--difficulty", "blind", "--out", tmp_path / "run")
+    said = thermofleet("run", small_toml, "--policy", f"{policy}:Idle", *options).succeeded()
+    jobs = run_json(tmp_path / "run")["metrics"]["jobs"]
+    told = re.search(
+        r"(\d+) jobs still waited at the end, though left and right were idle from", " ".join(said.err.split())
+    )
+    assert told
+    assert 1 < int(told[1]) <= jobs
 
 
 @pytest.mark.ci_slow

@@ -127,9 +127,26 @@ def test_the_begin_of_the_shift_is_a_date_of_toml_or_a_text(tmp_path):
         (["a,hold,bench,,,0:02,,,,", "b,hold,bench,,,0:01:30.5,,,,"], [("b", (), 90.5), ("a", (), 120.0)]),
         (["[A] 1/2,hold,bench,,,,,,,", "b,hold,shelf,,,,,,,[A] 1/2"], [("[A] 1/2", (), 0.0), ("b", ("[A] 1/2",), 0.0)]),
         (["4711,hold,bench,,,,,,,", "4711-100,hold,bench,,,,,,,"], [("4711", (), 0.0), ("4711-100", (), 0.0)]),
+        (['"A,2",hold,bench,,,,,,,', 'b,hold,shelf,,,1,,,,"A,2"'], [("A,2", (), 0.0), ("b", ("A,2",), 1.0)]),
+        (
+            ["a,hold,bench,,,,,,,", '"c;d",hold,bench,,,1,,,,', 'b,hold,shelf,,,2,,,,"c;d | a"'],
+            [("a", (), 0.0), ("c;d", (), 1.0), ("b", ("c;d", "a"), 2.0)],
+        ),
+        (
+            ["a,hold,bench,,,,,,,", "c,hold,bench,,,1,,,,", 'b,hold,shelf,,,2,,,,"c, a"'],
+            [("a", (), 0.0), ("c", (), 1.0), ("b", ("c", "a"), 2.0)],
+        ),
         (["a,hold,bench,,,0,,,,b", "b,hold,shelf,,,5,,,,"], [("a", ("b",), 0.0), ("b", (), 5.0)]),
     ],
-    ids=["clock times without a date", "odd names", "a name that continues another", "waiting for a row below"],
+    ids=[
+        "clock times without a date",
+        "odd names",
+        "a name that continues another",
+        "a comma in a name",
+        "a semicolon in a name",
+        "names with commas between",
+        "waiting for a row below",
+    ],
 )
 def test_rows_give_jobs_in_order_of_release(tmp_path, rows, jobs):
     scenario = small_table(tmp_path, "\n".join([SHORT, *rows]))
@@ -233,9 +250,12 @@ ERRORS = {
     "x,hold,bench;shelf,,,,,,,": "column places: give > between from and to, and | between alternatives, no comma or",
     "x,hold,bench,,,2026-11-23,,,,": "column release: a date needs shift_begin, the begin of the shift, or --shift-",
     "x,hold,bench,,,60,30,,,": "column due: must not be before the release at 60 s (got 30 s).",
+    "x,hold,bench,,,4:50,4:10,,,": "column due: must not be before the release at 4:50 (got 4:10).",
+    "x,hold,bench,,,0:01:30,60,,,": "column due: must not be before the release at 0:01:30 (got 60 s).",
     "x,hold,bench,,,,,yes,,": "column due: a hard due date needs a time.",
     "x,hold,bench,,,,,maybe,,": "column hard: expected yes or no (got 'maybe').",
     "x,hold,bench,,,,,,,y": "column after: there is no job 'y' in this table.",
+    'x,hold,bench,,,,,,,"y;g"': "column after: there is no job 'y;g' in this table; give | between names.",
     "x,hold,bench,,,,,,,x": "column after: jobs wait for each other in a cycle: x → x.",
     "x,hold,bench,,,,,,,,,9": ": 12 cells, but the head has 10; quote cells with separators.",
 }
@@ -272,6 +292,7 @@ def test_what_a_german_spreadsheet_writes_is_read_or_asked_about(tmp_path):
             "column release: 22 Nov 2026 06:00 is before the shift, which begins on 23 ",
         ),
         ("a;hold;bench;;;;46349,27;;;", "column due: is this 23 Nov 2026 06:28, in days as a spreadsheet counts? Give"),
+        ("a;hold;bench;;;;46349,9930555;;;", "column due: is this 23 Nov 2026 23:50, in days"),
         ("a;hold;bench;;;;2026-11-24;;;", "column due: a date needs a time, as 2026-11-24T14:00 (got '2026-11-24')"),
         ("a;hold;bench;;;6:01;5:00;;;", "column due: '5:00' is outside the shift, which begins at 06:00 and"),
     ):
@@ -314,6 +335,64 @@ def test_only_plain_numbers_are_scaled_to_the_unit_of_a_heading(tmp_path):
     assert {job.name: (job.release_s, job.due_s) for job in jobs} == {"a": (60.0, 120.0), "b": (0.0, 150.0)}
 
 
+def test_hours_among_clock_times_are_asked_about(tmp_path, caplog):
+    begin = "shift_begin = 2026-11-23T22:00:00+01:00"
+    for heading, time_, sentence in (
+        ("release", "23,5", "column release: is this 23:30 or 23:50? Give times as h:mm, or seconds in a column "),
+        ("release", "23.5", "column release: is this 23:30 or 23:50? Give times as h:mm, or seconds in a column "),
+        ("release", "23,0", "column release: is this 23:00? Give times as h:mm, or seconds in a column release_s (got"),
+        ("release", "23,30", "column release: is this 23:30? Give times as h:mm, or a number as 23,300."),
+        ("release", "23", ""),
+        ("release_s", "23,5", ""),
+        ("release", "23,300", ""),
+        ("release", "24,5", ""),
+    ):
+        text = f"name;kind;places;{heading};due\na;hold;bench;{time_};\nb;hold;bench;;22:02\n"
+        caplog.clear()
+        if sentence:
+            assert sentence in errors_of(tmp_path, text, begin)
+        else:
+            last = drawn(small_table(tmp_path, text, begin), 0)[-1]
+            assert last.release_s == float(time_.replace(",", "."))
+        warned = "row 2, column release: '23' counts as 23 s; is this 23:00? Give times as h:mm" in caplog.text
+        assert warned == (time_ == "23")
+    seconds = "name;kind;places;release;due\na;hold;bench;23,5;60\n"
+    assert drawn(small_table(tmp_path, seconds, begin), 0)[0].release_s == 23.5
+
+
+def test_a_due_date_before_the_jobs_that_must_finish_first_is_told(tmp_path, caplog):
+    begin = "shift_begin = 2026-11-23T22:00:00+01:00\nhorizon_s = 36000"
+    rows = "a1,hold,bench,,3,5:00,5:30,,,,20\na2,hold,bench,,,22:30,{},,,a1,\na3,hold,bench,,,,{},,,a2,"
+    sentence = "before it, 'a1' must finish, which has its release at 5:00; that takes at least "
+    short = SMALL.replace("horizon_s = 180", "")
+    for second, third, told in (
+        (
+            "23:40",
+            "5:00:30",
+            f"row 3, column due: {sentence}60 s, so the job cannot be on time (got 23:40).",
+        ),
+        (
+            "5:40",
+            "5:01",
+            f"row 4, column due: {sentence}60.5 s, so the job cannot be on time (got 5:01).",
+        ),
+        ("5:01", "5:01:01", ""),
+    ):
+        caplog.clear()
+        (tmp_path / "jobs.csv").write_text(f"{SHORT},dwell\n{rows.format(second, third)}\n", encoding="utf-8")
+        with_table(tmp_path / "cell.toml", short, "jobs.csv", begin)
+        assert told in caplog.text
+        assert ("cannot be on time" in caplog.text) == bool(told)
+    many = [f"b{i},hold,bench,,,,22:{i + 10},,,a1," for i in range(12)]
+    table = "\n".join([f"{SHORT},dwell", *many, "a1,hold,bench,,3,5:00,5:30,,,,20"])
+    caplog.clear()
+    (tmp_path / "jobs.csv").write_text(table, encoding="utf-8")
+    with_table(tmp_path / "cell.toml", short, "jobs.csv", begin)
+    assert caplog.text.count("so the job cannot be on time") == 5
+    rest = "rows 7, 8, 9, 10, 11 and 2 more, column due: the jobs in column after cannot finish before it, either."
+    assert rest in caplog.text
+
+
 def test_light_payloads_in_grams_are_asked_about(tmp_path):
     for grams, refused in (("0.5", True), ("200", False)):
         path = tmp_path / "jobs.csv"
@@ -330,19 +409,25 @@ def test_light_payloads_in_grams_are_asked_about(tmp_path):
 def test_times_of_a_sheet_are_those_that_it_shows(tmp_path):
     openpyxl = pytest.importorskip("openpyxl")
     begin, path = datetime(2026, 11, 23, 6, tzinfo=UTC), tmp_path / "jobs.xlsx"
-    for format_, day_fraction, release_s in (("[h]:mm", 0.25, 0.0), ("[h]:mm", 0.5, 21600.0), ("General", 0.25, None)):
+    for format_, day_fraction, release in (
+        ("[h]:mm", 0.25, 0.0),
+        ("[h]:mm", 0.5, 21600.0),
+        ("General", 0.25, "06:00"),
+        ("General", 0.9930555, "23:50"),  # 5 ms less
+        ("General", 0.9999999, "24:00"),
+    ):
         book = openpyxl.Workbook()
         book.active.append(["name", "kind", "places", "release"])
         book.active.append(["a", "hold", "bench", day_fraction])
         book.active["D2"].number_format = format_
         book.save(path)
-        if release_s is None:
+        if isinstance(release, str):
             with pytest.raises(
-                ScenarioError, match=r"is this 06:00\? Give its cell a format of time, or a number as a text"
+                ScenarioError, match=rf"is this {release}\? Give its cell a format of time, or a number as a text"
             ):
                 read_job_table(path, begin=begin)
         else:
-            assert [job.release_s for job in read_job_table(path, begin=begin).values()] == [release_s]
+            assert [job.release_s for job in read_job_table(path, begin=begin).values()] == [release]
 
 
 def test_a_quote_that_is_never_closed_is_told_and_no_row_is_lost(tmp_path):
@@ -427,21 +512,31 @@ def test_a_thousand_rows_are_read_and_all_their_errors_told_soon(tmp_path):
     assert time.process_time() - began_s < SOON_S
 
 
+def test_clock_times_are_not_asked_to_be_minutes(tmp_path, caplog):
+    for times, asked in ((("1", "2", "3"), True), (("0:01", "0:02", "0:03"), False), (("0:00:01", "2", "3"), False)):
+        caplog.clear()
+        rows = [f"j{i},hold,bench,,,{time_},,,," for i, time_ in enumerate(times)]
+        small_table(tmp_path, "\n".join([SHORT, *rows]))
+        assert ("Are these minutes? 3 min is 180 s." in caplog.text) == asked, times
+
+
 def test_jobs_that_cannot_finish_in_time_are_told(tmp_path, caplog, plans):
     table = small_table(tmp_path, f"{SHORT}\na,hold,bench,,,,1,,,\nb,hold,bench,,,,1,yes,,\nc,hold,bench,,,179,,,,\n")
+    clock_times = small_table(tmp_path, f"{SHORT}\na,hold,bench,,200,0:01,0:02,,,\n")
     raw = tomllib.loads(SMALL) | {"name": "heat", "horizon_s": 10}
     raw["jobs"][1]["due_s"] = 0.5
     late = raw | {
         "name": "late",
         "jobs": [raw["jobs"][0] | {"arrivals": {"kind": "batch", "count": 1, "start_s": 11.0}}],
     }
-    for scenario in (table, parse_scenario(raw, tmp_path), parse_scenario(late, tmp_path)):
+    for scenario in (table, clock_times, parse_scenario(raw, tmp_path), parse_scenario(late, tmp_path)):
         prepare(scenario, difficulty="blind", cache=plans)
     assert [re.sub(r"[\d.]+ s \(", "… s (", each.message) for each in caplog.records] == [
         "cell.toml: 'jobs.csv', row 2, column due: 'a' takes at least … s (1 cycle), but has 1 s until it is due. Are "
         "its times minutes? Give seconds.",
         "cell.toml: 'jobs.csv', row 4, column release: 'c' takes at least … s (1 cycle), but has 1 s until the shift "
         "ends. Are its times minutes? Give seconds.",
+        "cell.toml: 'jobs.csv', row 2, column due: 'a' takes at least … s (200 cycles), but has 60 s until it is due.",
         "heat.toml: horizon_s: 'hold' takes at least … s (1 cycle), but has 10 s until the shift ends. Are its times "
         "minutes? Give seconds.",
         "heat.toml: jobs[1].due_s: 'sort' takes at least … s (1 cycle), but has 0.5 s until it is due. Are its times "

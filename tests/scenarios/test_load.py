@@ -465,6 +465,17 @@ def test_a_scenario_in_which_no_job_arrives_says_so():
     assert "of the arms can do a job" not in str(describe(rare)[0])
 
 
+def test_the_hour_that_occurs_twice_has_its_zone():
+    scenario = cell(APART[0], places={"left": BESIDE["left"]})
+    (stream,) = scenario.jobs
+    begin = {"shift_begin": "2026-10-25T01:00+02:00", "time_zone": "Europe/Berlin", "horizon_s": 14_400.0}
+    night = replace(
+        scenario, **begin, jobs=(replace(stream, arrivals=Arrivals(kind="trace", times_s=(4500.0, 8100.0, 11_700.0))),)
+    )
+    told = " ".join(map(str, describe(night)))
+    assert "3 at Sun 25 Oct 02:15 CEST, Sun 25 Oct 02:15 CET, Sun 25 Oct 03:15" in told
+
+
 @pytest.mark.filterwarnings("error")  # matplotlib's, that the names leave no room for the figure
 def test_the_picture_of_a_cell_has_room_for_long_names(tmp_path):
     arms = [dict(each, name=f"{each['name']}{'_' * 50}") for each in APART]

@@ -64,6 +64,14 @@ def pair(small_toml: Path) -> tuple[Scenario, Scenario]:
     return from_file, override(load(small_toml), fixtures=[box])
 
 
+@pytest.mark.parametrize(("unit", "unit_mm"), [("m", 1000.0), ("mm", 1.0), ("cm", 10.0), ("in", 25.4)])
+def test_a_file_may_be_in_any_unit(small_toml: Path, unit: str, unit_mm: float) -> None:
+    low, high = (tuple(each / unit_mm for each in corner) for corner in (LOW, HIGH))
+    write_stl(small_toml.with_name("oven.stl"), (low, high))
+    (fixture,) = with_fixture(small_toml, mesh="oven.stl", unit=unit, position_m=[-0.2, 0.1, 0.3]).fixtures
+    assert fixture.size_m == pytest.approx((np.array(HIGH) - LOW) / 1000, abs=1e-5)
+
+
 def distances_m(scenario: Scenario, postures: np.ndarray) -> np.ndarray:
     """From each link of the left arm to the first fixture, at most 1 m."""
     robot = scenario.arms[0].robot()
@@ -175,7 +183,10 @@ UNIT = {"mesh": "big.stl"}
 WRONG = [
     (UNIT, r"'big.stl' is 800 × 600 × 20 m large; .* Is this in mm \(0.8 × 0.6 × 0.02 m\)\? Give unit = \"mm\"\."),
     ({"mesh": "small.stl", "unit": "mm"}, r"is 0.8 × 0.6 × 0.02 mm large; .* Is this in m \(0.8 × 0.6 × 0.02 m\)\?"),
-    (UNIT | {"unit": "cm"}, r"fixtures\[0\].unit: 'cm' is not allowed.* Allowed: m, mm"),
+    (
+        UNIT | {"unit": "dm"},
+        r"fixtures\[0\].unit: 'dm' is not allowed. Allowed: m, mm, cm, in. Export the file in one of",
+    ),
     (UNIT | {"size_m": [1, 1, 1]}, r"fixtures\[0\].size_m must be left out beside `mesh`"),
     ({"mesh": "none.stl"}, r"fixtures\[0\].mesh: 'none.stl': there is no such file\. Paths are relative to"),
     ({"mesh": "big.step"}, r"'big.step' must end in .stl, .obj, .glb, .xml, .mjcf, .urdf"),

@@ -353,6 +353,10 @@ def test_a_recording_has_what_arms_published_and_says_what_is_missing(tmp_path: 
             "boss",
             Result("boss", number=number, time_s=time_s, status=awarded, offers=offers, difficulty=time_s),
         )
+    for number, name in enumerate(("k", "7"), start=2):
+        waits = JobStatus(job=name, state="waiting", value=2.0, release_s=5.0, due_s=15.0)
+        recorder.add("boss", Result("boss", number=number, time_s=22.0, status=waits))
+    recorder.add("a", ArmEvent(arm="a", number=len(log), time_s=22.0, kind="lost", job="k", reason="another claim"))
     request = ControlRequest("r", Pause("*"), "ann")
     recorder.add("boss", Operation("boss", 30.0, request, 1))
     recorder.write(status="finished")
@@ -361,6 +365,12 @@ def test_a_recording_has_what_arms_published_and_says_what_is_missing(tmp_path: 
     assert (first.award.time_s, first.job["award"], first.job["difficulty"]) == (0.0, "award 0", 1.0)
     with pytest.raises(FleetError, match=r"'pause' is a request or an alarm, which has no causes .* award, return, "):
         thread_of(tmp_path, "pause")
+    for asked in ("k", "award@k"):
+        why = r"'k' was never awarded; its state is waiting\. k is unfinished .* Trace another event: lost@k\."
+        with pytest.raises(FleetError, match=why):
+            thread_of(tmp_path, asked)
+    with pytest.raises(FleetError, match=r"No event 7: rows of the event log are 0 to 5"):
+        thread_of(tmp_path, "7")
     thread = thread_of(tmp_path, "warning")
     assert thread.award is not None
     assert (thread.award.time_s, thread.twin) == (20.0, {"arm": "a", "version": "d:0123"})
