@@ -328,7 +328,7 @@ def fleet(cell, plans) -> Fleet:
 def test_a_row_equals_make_env_with_the_same_seed(cell, plans, play, e, difficulty, randomise) -> None:
     options: dict[str, Any] = {"difficulty": difficulty, "randomise": randomise, "cache": plans}
     batch, env = make_batch(cell, 6, LAST_SEED, **options), make_env(cell, **options)
-    steps = list(both(batch, env, e, LAST_SEED + e, play, steps=140))
+    steps = list(both(batch, env, e, LAST_SEED + e, play, steps=220))
     assert sum(bool(step["terminated"] | step["truncated"]) for step in steps) >= 2
     assert sum(int(step["faults"].sum()) for step in steps) > 0
 
