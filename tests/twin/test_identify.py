@@ -1,5 +1,6 @@
 """The thermal twin, and its parameters identified from recordings, with intervals."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -24,6 +25,7 @@ from fleet.heat.thermal import (
 )
 from fleet.motion import RATE_HZ, Drive, drives
 from fleet.robot import JOINTS
+from scenarios.cli.twin import doubts_of
 from scenarios.prepare.oracle import peaks
 from twin.logs.recording import READINGS, Recording, heat_logs, without_repeats
 from twin.thermal.checkpoint import CARD, load, load_curve, save, save_curve
@@ -405,6 +407,34 @@ def test_torque_and_speed_stand_in_for_a_current_that_was_not_recorded(rng):
     assert by_torque.source == "torque"
     # The recording's current knows no magnets and the law does: a few per cent of heat.
     assert by_torque.parameter("copper_w_per_a2", 2).value == pytest.approx(0.41, rel=0.1)
+
+
+UNLIKE = {
+    "as it is": (lambda r: r, ""),
+    "current √2": (
+        lambda r: replace(r, current_a=np.sqrt(2.0) * np.asarray(r.current_a)),
+        "Currents 0.[67].* RMS, or peak values",
+    ),
+    "torque 2": (lambda r: replace(r, current_a=None, tau=2.0 * r.tau), "Torques 0.[45].* as large .* in N·m"),
+    "drift": (
+        lambda r: replace(
+            r, temp_c=np.asarray(r.temp_c) + np.outer(np.linspace(0.0, 30.0, len(r.time_s)), np.eye(JOINTS)[1])
+        ),
+        "joint 2 without load is .* times as far above the ambient temperature as in a nominal Gen3. Check the",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", UNLIKE)
+def test_currents_and_temperatures_of_no_gen3_are_doubted(rng, name: str) -> None:
+    """Joint by joint the changes are within the spread of arms; together they are not."""
+    change, sentence = UNLIKE[name]
+    spread = ThermalSpread.gen3()
+    network = gen3_network(spread=spread, rng=rng)
+    recording, _ = logged(HeatModel(spread_motors(gen3_motors(), spread, rng), network), rng, 15.0)
+    doubts = doubts_of(identify([change(recording)], ambient_c=AIR_C))
+    assert bool(doubts) == bool(sentence)
+    assert re.search(sentence, "".join(doubts))
 
 
 def test_air_that_differs_from_log_to_log_is_put_down_to_the_air(rng):
