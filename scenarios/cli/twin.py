@@ -393,7 +393,10 @@ def train_command(
     size: Literal["quick", "full"] | None = option("quick or full. Default: as in the scenario; for logs quick.", None),
     cool: float = option("--log: temperature limit of joints 1 to 4 for training data, °C.", 40.0, low=0, high=200),
     hold_out: float = option(
-        "--log: share of the cool recordings held out to calibrate verdicts.", 0.3, low=0, high=0.9
+        "--log: share of the cool recordings held out to calibrate verdicts; none if these are fewer than 4.",
+        0.3,
+        low=0,
+        high=0.9,
     ),
     seed: int | None = option(
         "Seed of weights and training. Default: the scenario's, for logs 0.", None, low=0, high=MAX_SEED
@@ -408,7 +411,7 @@ def train_command(
     Cached twins take seconds. A twin of logs is kept in --out only.
     """
     check_source(scenario, log)
-    from scenarios.prepare.twins import TWINS, save_twins, train_arms, train_log
+    from scenarios.prepare.twins import FEWEST_RECORDINGS, TWINS, save_twins, train_arms, train_log
     from scenarios.spec.load import load
 
     check_free(out, TWINS, overwrite=overwrite)
@@ -436,7 +439,8 @@ def train_command(
     if log is not None:
         count = card["twins"][0]["calibrated_on"]
         alpha = f"verdicts with --alpha {math.ceil(1e4 / (count + 1)) / 1e4:g} or more" if count else "no verdicts"
-        say(f"Cool recordings held out (--hold-out): {count}, {alpha}; --alpha 0.05 needs 19.", out_console)
+        few = f" (this share of the cool recordings is less than {FEWEST_RECORDINGS})" if hold_out and not count else ""
+        say(f"Cool recordings held out (--hold-out): {count}{few}, {alpha}; --alpha 0.05 needs 19.", out_console)
     say(f"Written to {out}; score with: thermofleet twin score {out}", out_console)
 
 
