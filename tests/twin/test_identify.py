@@ -486,9 +486,14 @@ def test_logs_split_at_gaps_and_keep_the_mean_heat(rng):
     ("spoil", "says"),
     [
         (lambda r: [replace(r, temp_c=None)], "no motor temperatures. Record"),
-        (lambda r: [replace(r, temp_c=np.full_like(r.temp_c, 30.0))], "No motor warms or cools"),
-        (lambda r: [replace(r, current_a=0.0 * r.current_a)], "copper loss is unknown"),
-        (lambda r: [r.part(slice(60))], "at least 300 s are needed"),
+        (lambda r: [replace(r, temp_c=np.full_like(r.temp_c, 30.0))], "No motor warms or cools by .* of 'log'"),
+        (lambda r: [replace(r, current_a=0.0 * r.current_a)], "in 'log', so copper loss is unknown"),
+        (lambda r: [r.part(slice(3))], "Too little was recorded in 'log': 2 s, at least 300 s are needed"),
+        (
+            lambda r: [replace(r.part(slice(60)), name=name) for name in ("one", "two")],
+            r"in 2 logs \('one', …\): 118 s, at least",
+        ),
+        (lambda r: [r.part(np.arange(0, 361, 12))], "'log': 0 s in stretches without a gap, of 360 s, at least"),
         (lambda r: [replace(r, **{name: getattr(r, name)[:, :6] for name in READINGS})], "6 joints"),
     ],
 )

@@ -552,7 +552,7 @@ def identify(
             check_ambient(recording, ambient_c)
     source = source_of(recordings)
     logs = [log for r in recordings for log in heat_logs(r, nominal.motors, source, step_s=step_s)]
-    _check_logs(logs, nominal)
+    _check_logs(recordings, logs, nominal)
     problem, x = _fit(logs, ambient_c, sd_k, vector)
     jacobian = problem.jacobian(x)
     information = np.linalg.cholesky(jacobian.T @ jacobian).T
@@ -650,23 +650,28 @@ def check_ambient(log: Recording, ambient_c: float) -> None:
         )
 
 
-def _check_logs(logs: Sequence[HeatLog], nominal: HeatModel) -> None:
-    seconds = sum(log.time_s[-1] - log.time_s[0] for log in logs)
+def _check_logs(recordings: Sequence[Recording], logs: Sequence[HeatLog], nominal: HeatModel) -> None:
+    seconds, whole_s = sum(log.time_s[-1] - log.time_s[0] for log in logs), sum(r.duration_s for r in recordings)
+    names = f"'{recordings[0].name}'" if len(recordings) == 1 else f"{len(recordings)} logs ('{recordings[0].name}', …)"
     if seconds < LEAST_S:
+        length = f"{whole_s:.3g} s"
+        if whole_s >= LEAST_S:
+            length = f"{seconds:.3g} s in stretches without a gap, of {whole_s:.3g} s"
         raise IdentificationError(
-            f"The recordings have {seconds:.0f} s without a gap, at least {LEAST_S:.0f} s are needed. Record half an "
-            "hour of work and cooling."
+            f"Too little was recorded in {names}: {length}, at least {LEAST_S:.0f} s are needed. Record half an hour "
+            "of work and cooling."
         )
     change_k = max(float(np.ptp(log.temp_c, axis=0).max()) for log in logs)
     if change_k < LEAST_CHANGE_K:
         raise IdentificationError(
-            f"No motor warms or cools by more than {change_k:.2f} K within a recording, {LEAST_CHANGE_K} K are needed "
-            "at least. Record the arm while it works after a rest, or hold a load outstretched for some minutes."
+            f"No motor warms or cools by more than {change_k:.2f} K within a recording of {names}, {LEAST_CHANGE_K} K "
+            "are needed at least. Record the arm while it works after a rest, or hold a load outstretched for some "
+            "minutes."
         )
     motors = nominal.motors
     most_a = np.sqrt(max(log.current_sq(motors.coulomb_nm, motors.viscous_nms_per_rad).max() for log in logs))
     if most_a < LEAST_CURRENT_A:
         raise IdentificationError(
-            f"No motor carries more than {most_a:.2f} A, so copper loss is unknown. Record the "
+            f"No motor carries more than {most_a:.2f} A in {names}, so copper loss is unknown. Record the "
             "powered arm while it moves, or holds a posture against gravity."
         )
