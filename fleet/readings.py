@@ -292,16 +292,17 @@ def possible_temperatures(time_s: Array, temp_c: Array) -> Array:
 
 
 def _out_of_range(readings: Mapping[str, Array], degrees: bool) -> Iterator[BadReading]:
-    q = readings["q"]
+    q, remedy = readings["q"], "Are the joints in another order, or is this another arm?"
     if degrees:
         what = "beyond its stops, ±128.9°, ±147.8°, ±120.3° for joints 2, 4, 6"
-        remedy = "Are the joints in another order, or is this another arm?"
         yield from _limited(q, STOPS_RAD, np.rad2deg(q), "°", what, remedy)
     else:
         what = "beyond its stops, ±2.25, ±2.58, ±2.10 rad for joints 2, 4, 6"
         turned = q.min() >= 0 and (np.abs(half_turn(q)) <= STOPS_RAD).all()
-        remedy = "Are these degrees?" if np.abs(q).max() > 2 * np.pi else ""
-        remedy = "Do the angles run from 0 to 2π? Give them from −π to π." if turned and not remedy else remedy
+        if np.abs(q).max() > 2 * np.pi:
+            remedy = "Are these degrees?"
+        elif turned:
+            remedy = "Do the angles run from 0 to 2π? Give them from −π to π."
         yield from _limited(q, STOPS_RAD, q, " rad", what, remedy)
     speed = "Are these °/s? The unit is rad/s." if not degrees else "Check the unit, °/s."
     for channel, limit, unit, guess in (

@@ -158,6 +158,10 @@ SWAP = [0, 3, 2, 1, 4, 5, 6]
 TURN = 180 / np.pi
 WHOLE = {
     "joint 4 beyond its stop": (changed("Pos", lambda v: np.full_like(v, 170.0), 3), "joint 4 at 170° is beyond its"),
+    "joint 2 beyond its stop, in rad": (
+        plainly(lambda log: log.groups["Pos"].__setitem__((slice(None), 1), -2.5)),
+        "joint 2 at -2.5 rad is beyond its stops.* Are the joints in another order",
+    ),
     "Fahrenheit": (changed("Temp", lambda v: v * 1.8 + 32), r"above 85 °C. Are these °F \(then 3"),
     "one joint in Fahrenheit": (changed("Temp", lambda v: v * 1.8 + 32, 5), r"temperature of joint 6 .* °F"),
     "kelvin": (changed("Temp", lambda v: v + 273.15), r"Are these kelvin \(then 3"),
@@ -288,6 +292,11 @@ LINES = {
     "stale between": (lambda: stale(sound(rate_hz=10), 100, 200), range(101, 200), "all readings repeat for 9.9 s"),
     "a gap filled by interpolation": (lambda: filled(sound(), 100, 190), range(100, 190), "change evenly for 45.5 s"),
     "a second header": (lambda: sound().text().replace("\n", f"\n{','.join(NAMES)}\n", 2), (), "repeats the header"),
+    "a comma for thousands": (
+        lambda: sound().text() + "1," * 36 + "1\n",
+        (),
+        r"line 302: 37 fields where the header has 36 \(a comma in a number\?\)\.",
+    ),
     "a line of NUL bytes": (lambda: doubled(sound().text(), 1, 1) + "\0" * 90, (), "line 302: holds NUL bytes"),
 }
 """Text, rows that are dropped, and the sentence."""
@@ -298,8 +307,9 @@ def test_damaged_lines_are_named_and_cut_out(name: str, tmp_path: Path):
     make, rows, sentence = LINES[name]
     path = tmp_path / "log.csv"
     path.write_text(make(), encoding="utf-8")
-    with pytest.raises(LogError, match=f'{sentence}.*Use damaged="skip"'):
+    with pytest.raises(LogError, match=f'{sentence}.*Use damaged="skip"') as caught:
         read(path)
+    assert "?." not in str(caught.value)
     (recording,) = read(path, damaged="skip")
     assert len(recording.time_s) == ROWS - len(rows)
     assert recording.temp_c is not None
