@@ -59,6 +59,9 @@ AGREES = 1.6
 """Factor between velocity and change of position that sampling explains; the public logs have 0.86 to 1.12."""
 AMP_PER_NM = (0.01, 0.5)
 """Range of motor current over torque, A/(N·m); the public logs have 0.04 to 0.17."""
+PUBLIC_AMP_PER_NM, FRICTION_NM = 0.17, 10.0
+"""Largest current over torque in the public logs, A/(N·m); torque that may change without current: twice the largest
+friction of these logs, N·m."""
 UPRIGHT_NM = 11.0
 """Most torque that gravity causes while all angles are within 2π degrees of zero, with 4.5 kg, N·m."""
 MISFIT = 0.05
@@ -373,7 +376,7 @@ def _stuck(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]
     """
     works = (np.diff(readings["tau"], axis=0) != 0).any(axis=1)
     moved = np.abs(_steps(readings["q"])).sum(axis=1)
-    for channel in ("q", "tau", "current_a", "temp_c"):
+    for channel in _NAMES:
         if channel not in readings:
             continue
         changes = np.diff(readings[channel], axis=0) != 0
@@ -384,11 +387,14 @@ def _stuck(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]
                 value, span_s = readings[channel][a, j] + 0.0, time_s[b] - time_s[a]
                 whole = b - a == len(changes) and value == 0.0
                 never = whole and channel == "temp_c"
-                if coarse and not (whole and not readings["qd"][:, j].any() and not readings["q"][:, j].any()):
+                padded = whole and not readings["qd"][:, j].any() and not readings["q"][:, j].any()
+                if coarse and not padded and not _contradicted(channel, readings, j, slice(a, b + 1)):
                     continue
                 alive = np.delete(changes[a:b], j, axis=1).mean() >= 0.5
-                if channel == "q":
-                    alive = np.abs(readings["qd"][a:b, j]).mean() > DRIVES_RAD_S
+                if channel in ("q", "qd"):
+                    alive = _moves(channel, time_s, readings, j, slice(a, b + 1))
+                elif coarse:
+                    alive = True
                 elif channel != "temp_c":
                     alive |= moved[a:b].sum() > LEAST_MOTION_RAD
                 elif span_s >= 4 * STUCK_S and not changes[a:b].any():
@@ -398,12 +404,38 @@ def _stuck(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]
                     alive |= (alike or fine) and moves
                 if not never and not (alive and span_s >= STUCK_S):
                     continue
-                stands = "never changes, but its velocity does" if channel == "q" else f"is {value:.5g}"
+                stands = f"is {value:.5g}"
+                if channel in ("q", "qd"):
+                    stands = f"never changes, but its {'velocity' if channel == 'q' else 'angle'} does"
                 what = f"{_NAMES[channel]} of joint {j + 1} {stands}, for {span_s:.4g} s"
                 remedy = f"Is its sensor dead? {_WITHOUT.get(channel, _NEEDED)}"
                 if value == 0.0 and j == JOINTS - 1 and channel != "q":
                     remedy = "Is this an arm with six joints, padded with zeros? Only logs of a Gen3 (seven) are read."
                 yield BadReading(what, remedy, np.arange(a if value == 0.0 else a + 1, b + 1))
+
+
+def _moves(channel: str, time_s: Array, readings: Mapping[str, Array], joint: int, rows: slice) -> bool:
+    """Whether a joint whose angle or velocity stands for some rows moves, by the other one.
+
+    A velocity of 0 says nothing: slow logs miss moves.
+    """
+    dt_s, q, qd = np.diff(time_s[rows]), readings["q"][rows, joint], readings["qd"][rows, joint]
+    if channel == "q":
+        speed = np.abs(qd[:-1])
+        moves = speed > DRIVES_RAD_S
+        return bool(speed.mean() > DRIVES_RAD_S or (speed * dt_s)[moves].sum() > LEAST_MOTION_RAD)
+    apart = np.abs(half_turn(np.diff(q)) - qd[0] * dt_s)
+    return bool(qd[0] != 0.0 and apart[apart > LEAST_MOTION_RAD / 10].sum() > LEAST_MOTION_RAD)
+
+
+def _contradicted(channel: str, readings: Mapping[str, Array], joint: int, rows: slice) -> bool:
+    """Whether a loaded joint moves and its current changes while its torque stands, or the other way round."""
+    other = {"tau": "current_a", "current_a": "tau"}[channel]
+    if other not in readings or np.ptp(readings["q"][rows, joint]) < LEAST_MOTION_RAD:
+        return False
+    least_a = LEAST_TORQUE_NM * PUBLIC_AMP_PER_NM
+    least, change = (LEAST_TORQUE_NM, least_a) if channel == "tau" else (least_a, FRICTION_NM)
+    return bool(abs(readings[channel][rows, joint][0]) > least and np.ptp(readings[other][rows, joint]) > change)
 
 
 def _stale(time_s: Array, start: int, end: int) -> BadReading:

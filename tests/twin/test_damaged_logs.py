@@ -154,6 +154,23 @@ def filled(log: Log, first: int, last: int) -> str:
     return log.text()
 
 
+def short_moves(dead: str = "", joint: int = 0, *, noise: float = 1.0) -> str:
+    """A plain log at 1 Hz of short moves between rests, in which a sensor stands from the minute on."""
+    rng, log, time_s = np.random.default_rng(0), sound().plain(), np.arange(ROWS, dtype=float)
+    way = np.interp(time_s % 120.0, [20.0, 24.0, 80.0, 84.0], [0.0, 1.0, 1.0, 0.0])
+    moves, out = (time_s % 60.0 > 20.0) & (time_s % 60.0 < 24.0), time_s % 120.0 < 60.0
+    q, qd = START + 0.8 * way[:, None], np.tile(0.2 * (moves & out) - 0.2 * (moves & ~out), (7, 1)).T
+    tau = ARM.inverse_dynamics(q, qd, np.zeros_like(q), 2.0)
+    exact = {"Pos": q, "Velocity": qd, "Torque": tau, "Current": tau / TORQUE_PER_AMP}
+    sizes = {"Pos": 2e-4, "Velocity": 2e-3, "Torque": 0.1, "Current": 0.01}
+    for name, values in exact.items():
+        log.groups[name] = values + noise * sizes[name] * rng.standard_normal(values.shape)
+    log.time_s = time_s
+    if dead:
+        log.groups[dead][60:, joint] = log.groups[dead][60, joint]
+    return log.text(PLAIN_NAMES)
+
+
 SWAP = [0, 3, 2, 1, 4, 5, 6]
 TURN = 180 / np.pi
 WHOLE = {
@@ -189,6 +206,22 @@ WHOLE = {
     "no clock": (timed(np.zeros_like), "time is always 0 s"),
     "velocities in another order": (reordered([6, 5, 4, 3, 2, 1, 0], "Velocity"), "joint 1 follows the velocity of"),
     "an angle that stands for a minute": (rows_set("Pos", 1, 10, 270, 330.0), "angle of joint 2 never changes"),
+    "an angle that stands through short moves": (
+        lambda: short_moves("Pos", 1, noise=0.0),
+        "line [0-9]+: angle of joint 2 never changes, but its velocity does, for .* Every command needs it",
+    ),
+    "a velocity that stands": (
+        lambda: short_moves("Velocity", 1),
+        "line [0-9]+: velocity of joint 2 never changes, but its angle does, for .* Every command needs it",
+    ),
+    "a torque that stands without noise": (
+        lambda: short_moves("Torque", 1, noise=0.0),
+        "line [0-9]+: torque of joint 2 is .* Is its sensor dead. Every command needs it",
+    ),
+    "a current that stands without noise": (
+        lambda: short_moves("Current", 1, noise=0.0),
+        "line [0-9]+: current of joint 2 is .* Is its sensor dead",
+    ),
     "columns between bars": (lambda: sound().text().replace(",", "|"), "Columns are separated by commas"),
     "a velocity not measured": (changed("Velocity", np.zeros_like, 3), "velocity of joint 4 never changes"),
     "a dead current sensor": (
@@ -315,6 +348,13 @@ def test_damaged_lines_are_named_and_cut_out(name: str, tmp_path: Path):
     assert recording.temp_c is not None
     assert 25 < recording.temp_c.min() < recording.temp_c.max() < 45
     assert recording.dropped
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_short_moves_between_rests_are_read(noise: float, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(short_moves(noise=noise), encoding="utf-8")
+    assert len(read(path)[0].time_s) == ROWS
 
 
 def test_a_short_hold_is_told_but_stays(tmp_path: Path, caplog: pytest.LogCaptureFixture):
