@@ -14,7 +14,7 @@ import typer
 from fleet.errors import FleetError
 from fleet.fields import MAX_SEED, argument, option
 from fleet.job import BOUNDS
-from fleet.robot import JOINTS, POSTURES, RATING
+from fleet.robot import POSTURES, RATING
 from scenarios.cli import options
 from scenarios.cli.options import From, Given
 from scenarios.result_folder import check_file, check_folder, check_free, check_overwrite, new_file, new_folder
@@ -88,44 +88,22 @@ def identify_command(
 def doubts_of(network: "Identified") -> list[str]:
     """What speaks against an identified network, in sentences."""
     from twin.thermal.forecast import MOST_RESIDUAL_K, MOST_SD
-    from twin.thermal.identify import MOST_COMMON_SD
 
     doubts, worst_k = list[str](), max(map(max, network.rms_k.values()))
-    ask = "Check the units and the order of temperatures, currents and torques, and the ambient temperature."
     far, sd = max(
         ((p, abs(math.log(p.value / p.prior)) / p.prior_sd) for p in network.parameters), key=lambda each: each[1]
     )
     if sd > MOST_SD:
         of = "" if far.joint is None else f" of joint {far.joint}"
         doubts.append(f"{far.name}{of} is {far.value / far.prior:.2g} times that of a nominal Gen3")
-    copper, copper_sd = network.common_factor(["copper_w_per_a2"])
-    if abs(copper_sd) > MOST_COMMON_SD:
-        doubts.append(f"copper_w_per_a2 of all joints is {copper:.2g} times that of a nominal Gen3")
-        quantity, cause = "Currents", "are these RMS, or peak values, or in another unit"
-        if network.source == "torque":
-            quantity, cause = "Torques", "are these those of the joints, in N·m"
-        ask = f"{quantity} {math.sqrt(copper):.2g} times as large would fit a Gen3: {cause}? {ask}"
-    doubts += _unlike_idle(network)
+    unlike = network.unlike()
+    doubts += unlike.doubts
     if worst_k > MOST_RESIDUAL_K:
         doubts.append(f"a residual of {worst_k:.1f} K, where public logs have up to 0.3 K")
-    return [f"Do not trust this network: {', and '.join(doubts)}. {ask}"] if doubts else []
-
-
-def _unlike_idle(network: "Identified") -> list[str]:
-    """Joints whose idle temperature is not that of a Gen3; none if more than three differ, as in other cooling."""
-    from twin.thermal.identify import MOST_COMMON_SD
-
-    names = ["idle_w", "housing_ambient_k_per_w"]
-    unlike = [j for j in range(1, JOINTS + 1) if abs(network.common_factor(names, j)[1]) > MOST_COMMON_SD]
-    if len(unlike) > 3:
+    if not doubts:
         return []
-    factors = {
-        j: math.prod(network.parameter(n, j).value / network.parameter(n, j).prior for n in names) for j in unlike
-    }
-    return [
-        f"joint {j} without load is {factor:.2g} times as far above the ambient temperature as in a nominal Gen3"
-        for j, factor in factors.items()
-    ]
+    ask = "Check the units and the order of temperatures, currents and torques, and the ambient temperature."
+    return [" ".join(filter(None, (f"Do not trust this network: {', and '.join(doubts)}.", unlike.question, ask)))]
 
 
 def parameter_table(network: "Identified") -> Table:

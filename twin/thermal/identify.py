@@ -397,6 +397,8 @@ LEAST_WEIGHT = 0.01
 MOST_COMMON_SD = 3.5
 """Usual distance of a common factor, in standard deviations: up to 2.9 in public logs, of copper loss, and 0.8 of idle
 heat and cooling; 5.7 with currents √2 times as large, 3.8 with a temperature that drifts by 10 K in an hour."""
+MOST_UNLIKE_JOINTS = 3
+"""More joints with another idle temperature are those of an arm with other cooling."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -469,30 +471,73 @@ class Identified:
             return named[0]
         raise KeyError(f"{name} of joint {joint} was not free. Free: {sorted({p.name for p in self.parameters})}.")
 
-    def common_factor(self, names: Sequence[str], joint: int | None = None) -> tuple[float, float]:
-        """Most likely common factor of some parameters over their prior, and its distance from 1.
+    def unlike(self) -> "Unlike":
+        """Common changes of its parameters that no Gen3 has."""
+        if self.information is None:
+            return Unlike()
+        names = [(p.name, None if p.joint is None else p.joint - 1) for p in self.parameters]
+        shift = np.log([p.value / p.prior for p in self.parameters])
+        root = self.information.astype(float)
+        prior = np.diag(1.0 / np.array([p.prior_sd for p in self.parameters]) ** 2)
+        return Unlike.of(names, shift, prior, root.T @ root, self.source)
 
-        The distance is that of a score test, in standard deviations that arms have by the prior (Rao 1948). Several
-        joints that deviate together are less likely than one.
+
+@dataclass(frozen=True, kw_only=True)
+class Unlike:
+    """Common changes of an arm's parameters that no Gen3 has, although each alone may be within the spread of arms."""
+
+    doubts: tuple[str, ...] = ()
+    """Parts of a sentence."""
+    question: str = ""
+    """Probable cause, as a sentence; empty if it is unknown."""
+
+    @classmethod
+    def of(
+        cls,
+        names: Sequence[tuple[str, int | None]],
+        shift: Array,
+        prior: Array,
+        posterior: Array,
+        source: CurrentSource,
+    ) -> "Unlike":
+        """From the estimated logarithms of the parameters.
 
         Args:
-            names: Of parameters.
-            joint: 1..7; default: of all joints.
-
-        Returns:
-            1 and 0 if the logs do not inform it.
+            names: Name and joint (0..6) of each parameter.
+            shift: Less those of a nominal Gen3, [parameter].
+            prior: Inverse covariance before the logs, [parameter, parameter].
+            posterior: The same after the logs.
+            source: Of the current.
         """
-        chosen = np.array([p.name in names and joint in (None, p.joint) for p in self.parameters], dtype=float)
-        if self.information is None or not chosen.any():
-            return 1.0, 0.0
-        precision = 1.0 / np.array([p.prior_sd for p in self.parameters]) ** 2
-        score = precision * np.log([p.value / p.prior for p in self.parameters])
-        root = self.information.astype(float)
-        by_logs = np.diag(precision) - precision[:, None] * np.linalg.inv(root.T @ root) * precision
-        weight = float(chosen @ by_logs @ chosen)
-        if weight < LEAST_WEIGHT * float(chosen @ precision):
-            return 1.0, 0.0
-        return float(np.exp(chosen @ score / weight)), float(chosen @ score / np.sqrt(weight))
+        by_logs = prior - prior @ np.linalg.inv(posterior) @ prior
+
+        def common(chosen: Callable[[str, int | None], bool]) -> tuple[float, float]:
+            """Most likely common factor, and its distance from 1 in standard deviations (score test: Rao 1948)."""
+            pick = np.array([chosen(*name) for name in names], dtype=float)
+            weight, score = float(pick @ by_logs @ pick), float(pick @ prior @ shift)
+            if weight <= LEAST_WEIGHT * float(pick @ prior @ pick):
+                return 1.0, 0.0
+            return float(np.exp(score / weight)), abs(score) / float(np.sqrt(weight))
+
+        doubts, question = list[str](), ""
+        copper, copper_sd = common(lambda name, _: name == "copper_w_per_a2")
+        if copper_sd > MOST_COMMON_SD:
+            doubts.append(f"copper_w_per_a2 of all joints is {copper:.2g} times that of a nominal Gen3")
+            quantity, cause = "Currents", "are these RMS, or peak values, or in another unit"
+            if source == "torque":
+                quantity, cause = "Torques", "are these those of the joints, in N·m"
+            question = f"{quantity} {np.sqrt(copper):.2g} times as large would fit a Gen3: {cause}?"
+        sd = [common(lambda name, of, j=j: name in _IDLE and of == j)[1] for j in range(JOINTS)]
+        idle = [j for j in range(JOINTS) if sd[j] > MOST_COMMON_SD]
+        for j in idle if len(idle) <= MOST_UNLIKE_JOINTS else ():
+            rise = np.exp(sum(shift[i] for i, (name, of) in enumerate(names) if name in _IDLE and of == j))
+            above = f"{rise:.2g} times as far above the ambient temperature as in a nominal Gen3"
+            doubts.append(f"joint {j + 1} without load is {above}")
+        return cls(doubts=tuple(doubts), question=question)
+
+
+_IDLE = ("idle_w", "housing_ambient_k_per_w")
+"""Parameters whose product is the rise of an idle motor above the ambient temperature, roughly."""
 
 
 def nominal_heat_model(cooling: Cooling = "still_air") -> HeatModel:
