@@ -5,7 +5,7 @@ in `fleet/data/gen3_thermal.json`. Limits of the statistics leave room around 34
 """
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import resources
@@ -59,10 +59,15 @@ AGREES = 1.6
 """Factor between velocity and change of position that sampling explains; the public logs have 0.86 to 1.12."""
 AMP_PER_NM = (0.01, 0.5)
 """Range of motor current over torque, A/(N·m); the public logs have 0.04 to 0.17."""
+PUBLIC_AMP_PER_NM, FRICTION_NM = 0.17, 10.0
+"""Largest current over torque in the public logs, A/(N·m); torque that may change without current: twice the largest
+friction of these logs, N·m."""
 UPRIGHT_NM = 11.0
 """Most torque that gravity causes while all angles are within 2π degrees of zero, with 4.5 kg, N·m."""
 MISFIT = 0.05
 """Share of the squared torque that gravity leaves unexplained in a wrong log; of the public logs only one has more."""
+LARGE_JOINTS = 4
+"""Joints 1 to 4, of the large actuators."""
 BETTER = 3.0
 """Factor by which another reading of the log must reduce that share before it is named; at most 1.1 in that log."""
 BACK = 0.05
@@ -244,7 +249,7 @@ def judge_plan(time_s: Array, readings: Mapping[str, Array], *, degrees: bool) -
     bad = [*judge_time(time_s), *_out_of_range(readings, degrees)]
     if not bad and len(time_s) >= LEAST_ROWS and readings["qd"].any():  # else the speeds are those of the angles
         bad += _motion(time_s, readings, degrees)
-    return bad or unheld(readings)
+    return bad or unheld(readings) or list(_swapped_joints(readings))
 
 
 def runs(mask: Array, least: int = 1) -> list[tuple[int, int]]:
@@ -292,16 +297,17 @@ def possible_temperatures(time_s: Array, temp_c: Array) -> Array:
 
 
 def _out_of_range(readings: Mapping[str, Array], degrees: bool) -> Iterator[BadReading]:
-    q = readings["q"]
+    q, remedy = readings["q"], "Are the joints in another order, or is this another arm?"
     if degrees:
         what = "beyond its stops, ±128.9°, ±147.8°, ±120.3° for joints 2, 4, 6"
-        remedy = "Are the joints in another order, or is this another arm?"
         yield from _limited(q, STOPS_RAD, np.rad2deg(q), "°", what, remedy)
     else:
         what = "beyond its stops, ±2.25, ±2.58, ±2.10 rad for joints 2, 4, 6"
         turned = q.min() >= 0 and (np.abs(half_turn(q)) <= STOPS_RAD).all()
-        remedy = "Are these degrees?" if np.abs(q).max() > 2 * np.pi else ""
-        remedy = "Do the angles run from 0 to 2π? Give them from −π to π." if turned and not remedy else remedy
+        if np.abs(q).max() > 2 * np.pi:
+            remedy = "Are these degrees?"
+        elif turned:
+            remedy = "Do the angles run from 0 to 2π? Give them from −π to π."
         yield from _limited(q, STOPS_RAD, q, " rad", what, remedy)
     speed = "Are these °/s? The unit is rad/s." if not degrees else "Check the unit, °/s."
     for channel, limit, unit, guess in (
@@ -372,7 +378,7 @@ def _stuck(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]
     """
     works = (np.diff(readings["tau"], axis=0) != 0).any(axis=1)
     moved = np.abs(_steps(readings["q"])).sum(axis=1)
-    for channel in ("q", "tau", "current_a", "temp_c"):
+    for channel in _NAMES:
         if channel not in readings:
             continue
         changes = np.diff(readings[channel], axis=0) != 0
@@ -383,11 +389,14 @@ def _stuck(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]
                 value, span_s = readings[channel][a, j] + 0.0, time_s[b] - time_s[a]
                 whole = b - a == len(changes) and value == 0.0
                 never = whole and channel == "temp_c"
-                if coarse and not (whole and not readings["qd"][:, j].any() and not readings["q"][:, j].any()):
+                padded = whole and not readings["qd"][:, j].any() and not readings["q"][:, j].any()
+                if coarse and not padded and not _contradicted(channel, readings, j, slice(a, b + 1)):
                     continue
                 alive = np.delete(changes[a:b], j, axis=1).mean() >= 0.5
-                if channel == "q":
-                    alive = np.abs(readings["qd"][a:b, j]).mean() > DRIVES_RAD_S
+                if channel in ("q", "qd"):
+                    alive = _moves(channel, time_s, readings, j, slice(a, b + 1))
+                elif coarse:
+                    alive = True
                 elif channel != "temp_c":
                     alive |= moved[a:b].sum() > LEAST_MOTION_RAD
                 elif span_s >= 4 * STUCK_S and not changes[a:b].any():
@@ -397,12 +406,38 @@ def _stuck(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]
                     alive |= (alike or fine) and moves
                 if not never and not (alive and span_s >= STUCK_S):
                     continue
-                stands = "never changes, but its velocity does" if channel == "q" else f"is {value:.5g}"
+                stands = f"is {value:.5g}"
+                if channel in ("q", "qd"):
+                    stands = f"never changes, but its {'velocity' if channel == 'q' else 'angle'} does"
                 what = f"{_NAMES[channel]} of joint {j + 1} {stands}, for {span_s:.4g} s"
                 remedy = f"Is its sensor dead? {_WITHOUT.get(channel, _NEEDED)}"
                 if value == 0.0 and j == JOINTS - 1 and channel != "q":
                     remedy = "Is this an arm with six joints, padded with zeros? Only logs of a Gen3 (seven) are read."
                 yield BadReading(what, remedy, np.arange(a if value == 0.0 else a + 1, b + 1))
+
+
+def _moves(channel: str, time_s: Array, readings: Mapping[str, Array], joint: int, rows: slice) -> bool:
+    """Whether a joint whose angle or velocity stands for some rows moves, by the other one.
+
+    A velocity of 0 says nothing: slow logs miss moves.
+    """
+    dt_s, q, qd = np.diff(time_s[rows]), readings["q"][rows, joint], readings["qd"][rows, joint]
+    if channel == "q":
+        speed = np.abs(qd[:-1])
+        moves = speed > DRIVES_RAD_S
+        return bool(speed.mean() > DRIVES_RAD_S or (speed * dt_s)[moves].sum() > LEAST_MOTION_RAD)
+    apart = np.abs(half_turn(np.diff(q)) - qd[0] * dt_s)
+    return bool(qd[0] != 0.0 and apart[apart > LEAST_MOTION_RAD / 10].sum() > LEAST_MOTION_RAD)
+
+
+def _contradicted(channel: str, readings: Mapping[str, Array], joint: int, rows: slice) -> bool:
+    """Whether a loaded joint moves and its current changes while its torque stands, or the other way round."""
+    other = {"tau": "current_a", "current_a": "tau"}[channel]
+    if other not in readings or np.ptp(readings["q"][rows, joint]) < LEAST_MOTION_RAD:
+        return False
+    least_a = LEAST_TORQUE_NM * PUBLIC_AMP_PER_NM
+    least, change = (LEAST_TORQUE_NM, least_a) if channel == "tau" else (least_a, FRICTION_NM)
+    return bool(abs(readings[channel][rows, joint][0]) > least and np.ptp(readings[other][rows, joint]) > change)
 
 
 def _stale(time_s: Array, start: int, end: int) -> BadReading:
@@ -606,7 +641,28 @@ def _gravity(readings: Mapping[str, Array]) -> Iterator[BadReading]:
     q, tau = _slow(readings)
     if len(q) < 10 or np.sqrt((tau**2).mean(axis=0)).max() < LEAST_TORQUE_NM or (misfit := _misfit(q, tau)) < MISFIT:
         return
-    alternatives = [(_misfit(q_, tau_), meant) for q_, tau_, meant in _alternatives(q, tau)]
+    yield from _better(misfit, _misfit, _alternatives(q, tau))
+
+
+def _swapped_joints(readings: Mapping[str, Array]) -> Iterator[BadReading]:
+    """Torques of swapped large joints, also in a single posture: with the masses of the arm, and at most 5 kg.
+
+    Other orders and signs are not judged: a payload far from the flange may look like them.
+    """
+    q, tau = _slow(readings)
+    if len(q) and (misfit := _held_misfit(q, tau)) > MISFIT:
+        yield from _better(misfit, _held_misfit, _swaps(q, tau))
+
+
+def _held_misfit(q: Array, tau: Array) -> float:
+    return _unexplained([(q, tau)])
+
+
+def _better(
+    misfit: float, misfit_of: Callable[[Array, Array], float], readings: Iterable[tuple[Array, Array, str]]
+) -> Iterator[BadReading]:
+    """A misfit that another order, unit or sign of the joints reduces."""
+    alternatives = [(misfit_of(q, tau), meant) for q, tau, meant in readings]
     least, meant = min(alternatives, key=lambda each: each[0])
     if least * BETTER < misfit:
         what = f"the torques do not fit the angles: gravity leaves {misfit:.0%} of the squared torque unexplained"
@@ -693,6 +749,13 @@ def _alternatives(q: Array, tau: Array) -> Iterator[tuple[Array, Array, str]]:
         yield q, tau * sign, f"the other sign of the torque of joint {j + 1}"
         yield q * sign, tau, f"the other sign of the angle of joint {j + 1}"
     yield np.rad2deg(q), tau, "angles in radians"
+
+
+def _swaps(q: Array, tau: Array) -> Iterator[tuple[Array, Array, str]]:
+    for i, k in combinations(range(LARGE_JOINTS), 2):
+        order, name = _swapped(i, k), f"joints {i + 1} and {k + 1} swapped"
+        yield q, tau[:, order], f"the torques of {name}"
+        yield q[:, order], tau[:, order], name
 
 
 def _swapped(i: int, k: int) -> Array:

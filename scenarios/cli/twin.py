@@ -70,6 +70,7 @@ def identify_command(
     if as_json:
         card: dict[str, object] = {"arm": arm, "version": network.version, "data_hash": network.data_hash}
         card |= {"out": None if out is None else str(out), "ambient_c": ambient_c, "rms_k": network.rms_k}
+        card["doubts"] = doubts_of(network)
         card["parameters"] = [{**vars(p), "informed": p.informed} for p in network.parameters]
         print_json(card)
         return
@@ -95,10 +96,14 @@ def doubts_of(network: "Identified") -> list[str]:
     if sd > MOST_SD:
         of = "" if far.joint is None else f" of joint {far.joint}"
         doubts.append(f"{far.name}{of} is {far.value / far.prior:.2g} times that of a nominal Gen3")
+    unlike = network.unlike()
+    doubts += unlike.doubts
     if worst_k > MOST_RESIDUAL_K:
         doubts.append(f"a residual of {worst_k:.1f} K, where public logs have up to 0.3 K")
-    ask = "Check the units and the order of temperatures, currents and torques."
-    return [f"Do not trust this network: {', and '.join(doubts)}. {ask}"] if doubts else []
+    if not doubts:
+        return []
+    ask = "Check the units and the order of temperatures, currents and torques, and the ambient temperature."
+    return [" ".join(filter(None, (f"Do not trust this network: {', and '.join(doubts)}.", unlike.question, ask)))]
 
 
 def parameter_table(network: "Identified") -> Table:
@@ -366,7 +371,10 @@ def train_command(
     size: Literal["quick", "full"] | None = option("quick or full. Default: as in the scenario; for logs quick.", None),
     cool: float = option("--log: temperature limit of joints 1 to 4 for training data, °C.", 40.0, low=0, high=200),
     hold_out: float = option(
-        "--log: share of the cool recordings held out to calibrate verdicts.", 0.3, low=0, high=0.9
+        "--log: share of the cool recordings held out to calibrate verdicts; none if these are fewer than 4.",
+        0.3,
+        low=0,
+        high=0.9,
     ),
     seed: int | None = option(
         "Seed of weights and training. Default: the scenario's, for logs 0.", None, low=0, high=MAX_SEED
@@ -381,7 +389,7 @@ def train_command(
     Cached twins take seconds. A twin of logs is kept in --out only.
     """
     check_source(scenario, log)
-    from scenarios.prepare.twins import TWINS, save_twins, train_arms, train_log
+    from scenarios.prepare.twins import FEWEST_RECORDINGS, TWINS, save_twins, train_arms, train_log
     from scenarios.spec.load import load
 
     check_free(out, TWINS, overwrite=overwrite)
@@ -409,7 +417,8 @@ def train_command(
     if log is not None:
         count = card["twins"][0]["calibrated_on"]
         alpha = f"verdicts with --alpha {math.ceil(1e4 / (count + 1)) / 1e4:g} or more" if count else "no verdicts"
-        say(f"Cool recordings held out (--hold-out): {count}, {alpha}; --alpha 0.05 needs 19.", out_console)
+        few = f" (this share of the cool recordings is less than {FEWEST_RECORDINGS})" if hold_out and not count else ""
+        say(f"Cool recordings held out (--hold-out): {count}{few}, {alpha}; --alpha 0.05 needs 19.", out_console)
     say(f"Written to {out}; score with: thermofleet twin score {out}", out_console)
 
 

@@ -65,9 +65,12 @@ def _doubts(found: ThermalForecast, repetitions: int) -> list[str]:
             f"the load explains the temperatures only for an arm that is {found.distance_sd:.1f} standard deviations "
             "from the network"
         )
+    elif found.unlike.doubts:
+        reason = f"the load explains the temperatures only if {', and '.join(found.unlike.doubts)}"
     if reason:
         ask = "Check the units and the order of temperatures, currents and torques, and the ambient temperature."
-        doubts.append(f"Do not trust this forecast: in the log, {reason}. {ask}")
+        cause = f"{found.unlike.question} " if found.unlike.question else ""
+        doubts.append(f"Do not trust this forecast: in the log, {reason}. {cause}{ask}")
     if repetitions > 1 and found.way_back_rad > MOST_WAY_RAD:
         doubts.append(
             f"The plan ends {found.way_back_rad:.2f} rad from where it begins. The way back, between the repetitions, "
@@ -145,6 +148,7 @@ def card(found: ThermalForecast, so_far: Recording, origin: Mapping[str, str]) -
         "cycle_s": found.cycle_s,
         "residual_k": np.round(found.residual_k, 3).tolist(),
         "distance_sd": round(found.distance_sd, 3),
+        "unlike": [*found.unlike.doubts],
         "way_back_rad": round(found.way_back_rad, 3),
         "now_c": so_far_c(so_far).tolist(),
         "limits": limits(found),

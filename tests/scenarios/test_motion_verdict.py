@@ -52,6 +52,8 @@ def test_logs_get_a_verdict_and_a_map(thermofleet, folder, tmp_path, monkeypatch
     twins, drawn = tmp_path / "twins", tmp_path / "map.png"
     said = thermofleet("twin", "train", "--log", folder / "logs", *size, "--hold-out", 0.5, "--out", twins, "--json")
     assert json.loads(said.out)["twins"][0]["calibrated_on"] == 7
+    said = thermofleet("twin", "train", "--log", folder / "logs", *size, "--hold-out", 0.2, "--out", tmp_path / "few")
+    assert "(--hold-out): 0 (this share of the cool recordings is less than 4), no verdicts" in said.out
     asked = ("twin", "score", twins, "--verdict", "--log")
     said = thermofleet(*asked, folder / "heavy.csv", "--alpha", 0.125, "--json", "--map", drawn)
     (row,) = json.loads(said.out)["rows"]

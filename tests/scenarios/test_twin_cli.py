@@ -253,6 +253,7 @@ def test_an_identified_arm_is_told_whole_with_its_air_and_its_place_and_is_not_r
     network = replace(network, parameters=(replace(first, value=9.0 * first.prior), *others), rms_k={"monday": (0.6,)})
     wrong = "copper_w_per_a2 of joint 1 is 9 times that of a nominal Gen3, and a residual of 0.6 K"
     assert doubts_of(network)[0].startswith(f"Do not trust this network: {wrong}")
+    assert json.loads(thermofleet("twin", "identify", "--log", tmp_path / "monday.csv", "--json").out)["doubts"] == []
     before = (tmp_path / "rc" / "rc.json").read_bytes()
     assert thermofleet(*identify, "--ambient", 55, "--overwrite").refused(
         "has a motor at 30.0 °C, below the ambient temperature of 55 °C"

@@ -154,10 +154,31 @@ def filled(log: Log, first: int, last: int) -> str:
     return log.text()
 
 
+def short_moves(dead: str = "", joint: int = 0, *, noise: float = 1.0) -> str:
+    """A plain log at 1 Hz of short moves between rests, in which a sensor stands from the minute on."""
+    rng, log, time_s = np.random.default_rng(0), sound().plain(), np.arange(ROWS, dtype=float)
+    way = np.interp(time_s % 120.0, [20.0, 24.0, 80.0, 84.0], [0.0, 1.0, 1.0, 0.0])
+    moves, out = (time_s % 60.0 > 20.0) & (time_s % 60.0 < 24.0), time_s % 120.0 < 60.0
+    q, qd = START + 0.8 * way[:, None], np.tile(0.2 * (moves & out) - 0.2 * (moves & ~out), (7, 1)).T
+    tau = ARM.inverse_dynamics(q, qd, np.zeros_like(q), 2.0)
+    exact = {"Pos": q, "Velocity": qd, "Torque": tau, "Current": tau / TORQUE_PER_AMP}
+    sizes = {"Pos": 2e-4, "Velocity": 2e-3, "Torque": 0.1, "Current": 0.01}
+    for name, values in exact.items():
+        log.groups[name] = values + noise * sizes[name] * rng.standard_normal(values.shape)
+    log.time_s = time_s
+    if dead:
+        log.groups[dead][60:, joint] = log.groups[dead][60, joint]
+    return log.text(PLAIN_NAMES)
+
+
 SWAP = [0, 3, 2, 1, 4, 5, 6]
 TURN = 180 / np.pi
 WHOLE = {
     "joint 4 beyond its stop": (changed("Pos", lambda v: np.full_like(v, 170.0), 3), "joint 4 at 170° is beyond its"),
+    "joint 2 beyond its stop, in rad": (
+        plainly(lambda log: log.groups["Pos"].__setitem__((slice(None), 1), -2.5)),
+        "joint 2 at -2.5 rad is beyond its stops.* Are the joints in another order",
+    ),
     "Fahrenheit": (changed("Temp", lambda v: v * 1.8 + 32), r"above 85 °C. Are these °F \(then 3"),
     "one joint in Fahrenheit": (changed("Temp", lambda v: v * 1.8 + 32, 5), r"temperature of joint 6 .* °F"),
     "kelvin": (changed("Temp", lambda v: v + 273.15), r"Are these kelvin \(then 3"),
@@ -185,6 +206,22 @@ WHOLE = {
     "no clock": (timed(np.zeros_like), "time is always 0 s"),
     "velocities in another order": (reordered([6, 5, 4, 3, 2, 1, 0], "Velocity"), "joint 1 follows the velocity of"),
     "an angle that stands for a minute": (rows_set("Pos", 1, 10, 270, 330.0), "angle of joint 2 never changes"),
+    "an angle that stands through short moves": (
+        lambda: short_moves("Pos", 1, noise=0.0),
+        "line [0-9]+: angle of joint 2 never changes, but its velocity does, for .* Every command needs it",
+    ),
+    "a velocity that stands": (
+        lambda: short_moves("Velocity", 1),
+        "line [0-9]+: velocity of joint 2 never changes, but its angle does, for .* Every command needs it",
+    ),
+    "a torque that stands without noise": (
+        lambda: short_moves("Torque", 1, noise=0.0),
+        "line [0-9]+: torque of joint 2 is .* Is its sensor dead. Every command needs it",
+    ),
+    "a current that stands without noise": (
+        lambda: short_moves("Current", 1, noise=0.0),
+        "line [0-9]+: current of joint 2 is .* Is its sensor dead",
+    ),
     "columns between bars": (lambda: sound().text().replace(",", "|"), "Columns are separated by commas"),
     "a velocity not measured": (changed("Velocity", np.zeros_like, 3), "velocity of joint 4 never changes"),
     "a dead current sensor": (
@@ -288,6 +325,11 @@ LINES = {
     "stale between": (lambda: stale(sound(rate_hz=10), 100, 200), range(101, 200), "all readings repeat for 9.9 s"),
     "a gap filled by interpolation": (lambda: filled(sound(), 100, 190), range(100, 190), "change evenly for 45.5 s"),
     "a second header": (lambda: sound().text().replace("\n", f"\n{','.join(NAMES)}\n", 2), (), "repeats the header"),
+    "a comma for thousands": (
+        lambda: sound().text() + "1," * 36 + "1\n",
+        (),
+        r"line 302: 37 fields where the header has 36 \(a comma in a number\?\)\.",
+    ),
     "a line of NUL bytes": (lambda: doubled(sound().text(), 1, 1) + "\0" * 90, (), "line 302: holds NUL bytes"),
 }
 """Text, rows that are dropped, and the sentence."""
@@ -298,13 +340,21 @@ def test_damaged_lines_are_named_and_cut_out(name: str, tmp_path: Path):
     make, rows, sentence = LINES[name]
     path = tmp_path / "log.csv"
     path.write_text(make(), encoding="utf-8")
-    with pytest.raises(LogError, match=f'{sentence}.*Use damaged="skip"'):
+    with pytest.raises(LogError, match=f'{sentence}.*Use damaged="skip"') as caught:
         read(path)
+    assert "?." not in str(caught.value)
     (recording,) = read(path, damaged="skip")
     assert len(recording.time_s) == ROWS - len(rows)
     assert recording.temp_c is not None
     assert 25 < recording.temp_c.min() < recording.temp_c.max() < 45
     assert recording.dropped
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_short_moves_between_rests_are_read(noise: float, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(short_moves(noise=noise), encoding="utf-8")
+    assert len(read(path)[0].time_s) == ROWS
 
 
 def test_a_short_hold_is_told_but_stays(tmp_path: Path, caplog: pytest.LogCaptureFixture):
@@ -551,4 +601,21 @@ def test_a_plan_in_other_units_is_refused(name: str, tmp_path: Path) -> None:
         if sound_plan:
             assert len(read(path, measured=False)[0].time_s) == len(time_s)
     with pytest.raises(LogError, match=question):
+        read(path, measured=False)
+
+
+@pytest.mark.parametrize(("pair", "group"), [((0, 1), "Torque"), ((1, 3), "Torque"), ((1, 3), "Pos")])
+def test_a_plan_of_one_posture_with_swapped_joints_is_refused(
+    pair: tuple[int, int], group: str, tmp_path: Path
+) -> None:
+    """Seven torques do not identify mount, masses and payload; those of a Gen3 with at most 5 kg they contradict."""
+    log, path = sound(rows=30, swing=0.0, kg=1.5).plain(), tmp_path / "plan.csv"
+    for swapped in (False, True):
+        if swapped:
+            for name in {"Torque", group}:
+                log.groups[name][:, list(pair)] = log.groups[name][:, list(pair[::-1])]
+        path.write_text(log.text(PLAIN_NAMES), encoding="utf-8")
+        if not swapped:
+            assert len(read(path, measured=False)[0].time_s) == 30
+    with pytest.raises(LogError, match=f"joints {pair[0] + 1} and {pair[1] + 1} swapped it would be 0%"):
         read(path, measured=False)

@@ -203,6 +203,11 @@ def test_temperatures_of_other_joints_and_other_currents_are_told(hour, few_samp
     assert log.current_a is not None
     half = forecast(replace(log, current_a=0.5 * log.current_a), held(FULL_REACH_NM), 30, ambient_c=AIR_C)
     assert found.distance_sd < MOST_SD < half.distance_sd
+    drift_k = np.outer(np.linspace(0.0, 12.0, len(log.time_s)), np.eye(7)[3])
+    drifting = forecast(replace(log, temp_c=log.temp_c + drift_k), held(FULL_REACH_NM), 30, ambient_c=AIR_C)
+    assert max(drifting.residual_k) < MOST_RESIDUAL_K
+    assert drifting.distance_sd < MOST_SD
+    assert "joint 4 without load is 3." in summary(drifting, log, 30)[0]
     said = [summary(each, log, 30)[0].startswith("Do not trust this forecast") for each in (found, wrong, half)]
     assert said == [False, True, True]
 

@@ -1,5 +1,6 @@
 """The thermal twin, and its parameters identified from recordings, with intervals."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -24,6 +25,7 @@ from fleet.heat.thermal import (
 )
 from fleet.motion import RATE_HZ, Drive, drives
 from fleet.robot import JOINTS
+from scenarios.cli.twin import doubts_of
 from scenarios.prepare.oracle import peaks
 from twin.logs.recording import READINGS, Recording, heat_logs, without_repeats
 from twin.thermal.checkpoint import CARD, load, load_curve, save, save_curve
@@ -407,6 +409,34 @@ def test_torque_and_speed_stand_in_for_a_current_that_was_not_recorded(rng):
     assert by_torque.parameter("copper_w_per_a2", 2).value == pytest.approx(0.41, rel=0.1)
 
 
+UNLIKE = {
+    "as it is": (lambda r: r, ""),
+    "current √2": (
+        lambda r: replace(r, current_a=np.sqrt(2.0) * np.asarray(r.current_a)),
+        "Currents 0.[67].* RMS, or peak values",
+    ),
+    "torque 2": (lambda r: replace(r, current_a=None, tau=2.0 * r.tau), "Torques 0.[45].* as large .* in N·m"),
+    "drift": (
+        lambda r: replace(
+            r, temp_c=np.asarray(r.temp_c) + np.outer(np.linspace(0.0, 30.0, len(r.time_s)), np.eye(JOINTS)[1])
+        ),
+        "joint 2 without load is .* times as far above the ambient temperature as in a nominal Gen3. Check the",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", UNLIKE)
+def test_currents_and_temperatures_of_no_gen3_are_doubted(rng, name: str) -> None:
+    """Joint by joint the changes are within the spread of arms; together they are not."""
+    change, sentence = UNLIKE[name]
+    spread = ThermalSpread.gen3()
+    network = gen3_network(spread=spread, rng=rng)
+    recording, _ = logged(HeatModel(spread_motors(gen3_motors(), spread, rng), network), rng, 15.0)
+    doubts = doubts_of(identify([change(recording)], ambient_c=AIR_C))
+    assert bool(doubts) == bool(sentence)
+    assert re.search(sentence, "".join(doubts))
+
+
 def test_air_that_differs_from_log_to_log_is_put_down_to_the_air(rng):
     body = nominal_heat_model()
     recordings = [logged(body, rng, 20.0, name=f"log {i}")[0] for i in range(3)]
@@ -456,9 +486,14 @@ def test_logs_split_at_gaps_and_keep_the_mean_heat(rng):
     ("spoil", "says"),
     [
         (lambda r: [replace(r, temp_c=None)], "no motor temperatures. Record"),
-        (lambda r: [replace(r, temp_c=np.full_like(r.temp_c, 30.0))], "No motor warms or cools"),
-        (lambda r: [replace(r, current_a=0.0 * r.current_a)], "copper loss is unknown"),
-        (lambda r: [r.part(slice(60))], "at least 300 s are needed"),
+        (lambda r: [replace(r, temp_c=np.full_like(r.temp_c, 30.0))], "No motor warms or cools by .* of 'log'"),
+        (lambda r: [replace(r, current_a=0.0 * r.current_a)], "in 'log', so copper loss is unknown"),
+        (lambda r: [r.part(slice(3))], "Too little was recorded in 'log': 2 s, at least 300 s are needed"),
+        (
+            lambda r: [replace(r.part(slice(60)), name=name) for name in ("one", "two")],
+            r"in 2 logs \('one', …\): 118 s, at least",
+        ),
+        (lambda r: [r.part(np.arange(0, 361, 12))], "'log': 0 s in stretches without a gap, of 360 s, at least"),
         (lambda r: [replace(r, **{name: getattr(r, name)[:, :6] for name in READINGS})], "6 joints"),
     ],
 )

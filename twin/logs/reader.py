@@ -261,9 +261,9 @@ def _numbers(line: str, names: Sequence[str], separator: str) -> list[float]:
     """
     cells = line.replace('"', "").split(separator)
     if len(cells) != len(names):
-        quoted = "; is there a comma in a quoted number?" if '"' in line and len(cells) > len(names) else ""
+        comma = " (a comma in a number?)" if separator == "," and len(cells) > len(names) else ""
         fields = f"{len(cells)} field{'s' * (len(cells) > 1)}"
-        raise ValueError(f"{fields} where the header has {len(names)}{quoted}")
+        raise ValueError(f"{fields} where the header has {len(names)}{comma}")
     with suppress(ValueError):
         numbers = list(map(float, cells))
         if all(map(isfinite, numbers)):

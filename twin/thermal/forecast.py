@@ -38,6 +38,7 @@ from twin.thermal.identify import (
     Noise,
     ParameterVector,
     Problem,
+    Unlike,
     check_ambient,
     nominal_heat_model,
     solve,
@@ -101,6 +102,8 @@ class ThermalForecast:
     """Root mean square difference of the updated network's temperatures from those of the log, K, [joint]."""
     distance_sd: float
     """Largest distance of a parameter of the updated network from the one before, in its standard deviations."""
+    unlike: Unlike
+    """Without a network: common changes of the updated one that no Gen3 has."""
     way_back_rad: float
     """Largest change of a joint from the begin to the end of the plan; with repetitions, a motion that is left out."""
 
@@ -236,8 +239,16 @@ def forecast(
         ambient_c=ambient_c,
         residual_k=np.sqrt(np.mean(problem.unexplained(likely)[0] ** 2, axis=0)),
         distance_sd=float((np.abs(likely - vector.mean) / np.hypot(vector.sd, FROM_LOG_TO_LOG)).max()),
+        unlike=Unlike() if network is not None else _unlike(problem, likely),
         way_back_rad=float(np.abs(half_turn(plan.q[-1] - plan.q[0])).max()),
     )
+
+
+def _unlike(problem: Problem, likely: Array) -> Unlike:
+    """Common changes of a nominal Gen3 by a log."""
+    vector, jacobian = problem.vector, problem.jacobian(likely)
+    prior = vector.information.T @ vector.information
+    return Unlike.of(vector.names, likely - vector.mean, prior, jacobian.T @ jacobian, problem.logs[0].source)
 
 
 def _parameters(network: Identified | None) -> ParameterVector:
