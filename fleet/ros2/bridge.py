@@ -292,15 +292,16 @@ class Follower:
             self._link.reject(f"of {topic.name}", error)
 
     def _send_state(self, now_s: float) -> None:
-        self._tick += 1
         state = self._state(now_s)
         if state is None and now_s >= self._warn_from_s:
             self._warn("state", f"publishes no state: there is {self._readings.missing(now_s)}.")
         if state is not None:
+            self._tick = state.tick
             self._publish_state(self._with_scores(state, now_s))
 
     def _state(self, now_s: float) -> State | None:
-        return self._readings.state(self._arm, self._tick, self._clock.now_s(now_s), now_s, self._warning_c)
+        """The next state: only published ones count, as receivers take a gap in the ticks for lost states."""
+        return self._readings.state(self._arm, self._tick + 1, self._clock.now_s(now_s), now_s, self._warning_c)
 
     def _with_scores(self, state: State, now_s: float) -> State:
         """The state with what the monitor makes of the arm's motion, if the arm reports all that it needs."""

@@ -336,6 +336,18 @@ def test_a_real_arm_is_an_arm_of_the_fleet(place, hashes):
     assert ticks == sorted(set(ticks))
 
 
+def test_states_that_a_pause_of_the_driver_withholds_are_not_lost_ones(place, monkeypatch):
+    """A recorder counts gaps in the ticks as missed messages."""
+    monkeypatch.setattr(ros2_bridge, "FRESH_S", 0.1)
+    place.until(lambda: place.states)
+    paused_s = time.monotonic()
+    place.until(lambda: time.monotonic() > paused_s + 0.5, lambda: None)
+    published = len(place.states)
+    place.until(lambda: len(place.states) > published)
+    ticks = [state.tick for state in place.states]
+    assert ticks == list(range(ticks[0], ticks[0] + len(ticks)))
+
+
 class Seen:
     """A monitor that keeps its readings."""
 
