@@ -8,9 +8,10 @@ malformed message is counted and logged, and never raises; a malformed request i
 
 import logging
 import math
+import re
 import threading
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -45,6 +46,10 @@ MOST_REPLIES = 1024
 """Replies to one query that are read: one of each arm of the largest fleet."""
 MOST_REJECTIONS, MOST_CHARACTERS = 1024, 2048
 """Places whose last malformed message is kept (a state of each arm of the largest fleet); length of a kept reason."""
+MOST_COUNTED = 256
+"""Reasons whose messages are counted one by one for the log; those of all others are counted together."""
+_DECIMAL = re.compile(r"\d+\.\d+")
+"""A measured value, which differs from one reason to the next of the same fault."""
 
 Action = Literal["publish", "show the token", "reply to", "query"]
 """What a certificate may or may not allow under a key."""
@@ -159,6 +164,8 @@ class BusClient(Connection):
         self.fleet = fleet
         self.malformed = 0
         self.rejections: OrderedDict[str, tuple[str, float]] = OrderedDict()
+        self._rejected: Counter[str] = Counter()
+        """Number of malformed messages by place and reason; of those beyond `MOST_COUNTED` under ""."""
         self.overrun = 0
         self._calls: Mailbox[tuple[Callable[..., None], tuple[Any, ...]]] = Mailbox(backlog)
         self._participant: RosterEntry | None = None
@@ -463,7 +470,7 @@ class BusClient(Connection):
         return {place: reason for place, (reason, at_s) in self.rejections.items() if at_s >= since_s}
 
     def reject(self, place: str, error: object) -> None:
-        """Count and log a malformed message.
+        """Count a malformed message; the log has the first, second, fourth, … one of each place and reason.
 
         Args:
             place: Where it was, for example `under`; `rejections` keeps the last one of each.
@@ -475,8 +482,14 @@ class BusClient(Connection):
         self.rejections.move_to_end(place)
         if len(self.rejections) > MOST_REJECTIONS:
             self.rejections.popitem(last=False)
-        if self.malformed & (self.malformed - 1) == 0:  # 1, 2, 4, 8, …: a flood of messages must not flood the log
-            _LOG.warning("Dropped invalid message (%d so far): %s", self.malformed, reason)
+        fault = _DECIMAL.sub("", reason[:MOST_CHARACTERS])
+        if fault not in self._rejected and len(self._rejected) >= MOST_COUNTED:
+            fault = ""
+        self._rejected[fault] += 1
+        count = self._rejected[fault]
+        if count & (count - 1) == 0:  # 1, 2, 4, 8, …: a flood of messages must not flood the log
+            alike = "like this" if fault else "of other kinds"
+            _LOG.warning("Dropped invalid message (%d %s so far): %s", count, alike, reason)
 
     # Inside
 
