@@ -215,7 +215,7 @@ def _fastest(recent: Sequence[tuple[Joints, float]]) -> float:
     now = recent[-1][0]
     if now.qd:
         return max(map(abs, now.qd))
-    if len(recent) < 2 or not all(joints.q for joints, _ in recent):
+    if len(recent) < 2:
         return 0.0
     stamps = np.array([joints.time_s for joints, _ in recent])
     at_s = stamps if (np.diff(stamps) > 0).all() else np.array([real_s for _, real_s in recent])

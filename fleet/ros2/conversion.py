@@ -61,7 +61,7 @@ def in_order(joints: Joints, names: tuple[str, ...]) -> Joints | None:
     A velocity or effort that is NaN for every named joint counts as not measured: ros2_control writes so.
 
     Raises:
-        MalformedMessage: a joint is missing or named twice, or one of its values is not finite.
+        MalformedMessage: a joint is missing or named twice, it has no positions, or a value is not finite.
     """
     at = {name: index for index, name in enumerate(joints.names)}
     missing = [name for name in names if name not in at]
@@ -71,6 +71,8 @@ def in_order(joints: Joints, names: tuple[str, ...]) -> Joints | None:
         raise MalformedMessage(f"A JointState has {', '.join(sorted(at))}, but not {', '.join(missing)}.")
     if twice := [name for name in names if joints.names.count(name) > 1]:
         raise MalformedMessage(f"A JointState names {', '.join(twice)} twice.")
+    if not joints.q:
+        raise MalformedMessage(f"A JointState has no position of {', '.join(names)}.")
     selected: dict[str, tuple[float, ...]] = {}
     for field, ros_field in _FIELDS.items():
         values = getattr(joints, field)

@@ -252,6 +252,7 @@ def test_order_and_other_joints_do_not_matter(q, qd, tau, seed, more):
         (Joints(0.0, ("joint_1",), (1.0,)), "not joint_2"),
         (Joints(0.0, ("joint_1", "joint_2", "joint_1"), (1.0, 2.0, 1.0)), "joint_1 twice"),
         (Joints(0.0, ("joint_1", "joint_2"), (math.nan, math.nan)), "nan for position of joint_1"),
+        (Joints(0.0, ("joint_1", "joint_2"), (), (0.0, 0.0)), "no position of joint_1, joint_2"),
         (Joints(0.0, ("joint_2", "joint_1"), (1.0, 1.0), (math.nan, 0.0)), "nan for velocity of joint_2"),
         (Joints(0.0, ("joint_1", "joint_2"), (1.0, 1.0), (), (math.inf, 0.0)), "inf for effort of joint_1"),
     ],
