@@ -284,7 +284,10 @@ class Follower:
             if topic.kind == JOINT_STATE:
                 self._readings.update_joints(read_joints(payload), now_s)
             else:
-                temp_c = temperatures(read_diagnostics(payload), self._readings.names, self._readings.hardware)
+                statuses = read_diagnostics(payload)
+                temp_c, faults = temperatures(statuses, self._readings.names, self._readings.hardware)
+                for fault in faults:
+                    self._link.reject(f"of {topic.name}", fault)
                 self._readings.update_temperatures(temp_c, now_s)
                 for sentence in self._readings.sensors.bad.values():
                     self._warn(f"sensor of {sentence[:7]}", f"has an impossible temperature: {sentence}; {BAD_SENSOR}.")

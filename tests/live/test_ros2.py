@@ -392,6 +392,16 @@ def test_malformed_messages_are_counted_and_change_nothing(place, rubbish):
     assert {state.temp_c for state in place.states} == {TEMP_C}
 
 
+def test_one_unusable_temperature_leaves_the_others(place, caplog):
+    def send():
+        place.play(joint_state())
+        place.warm(diagnostics(temp_c=(*TEMP_C[:6], "41.5 C")))
+
+    readings = place.follower._readings
+    place.until(lambda: readings.missing(time.monotonic()) == "no temperature of joint_7", send)
+    assert "temperature_c of gen3/joint_7 is no number: '41.5 C'" in caplog.text
+
+
 def test_a_real_arm_takes_no_work_and_gives_the_reason(place):
     place.until(lambda: place.states)
     job = JobSpec(name="j", kind="hold", places=("rack",))
