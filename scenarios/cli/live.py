@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 UNHEALTHY = 1
 """Exit code of `bus doctor`; 0 is a healthy fleet, and 2, as for every error of use, one that cannot be reached."""
+LINK_S = 3.0
+"""Real seconds between two checks of the links of a router."""
 _TLS = "Mutual TLS"
 _WEBHOOK = option(
     "URL that gets every change of an alarm; may be repeated. It is signed with THERMOFLEET_WEBHOOK_SECRET; beyond "
@@ -157,7 +159,9 @@ def router_command(
     router = Router(port, host=host, tls=own, state_hz=state_hz or None, connect=connect or ())
     with until_stopped() as stop, router:
         echo(router.endpoint)  # flushed: a supervisor reads this line
-        stop.wait()
+        while not stop.wait(LINK_S if connect else None):
+            for sentence in router.link_changes():
+                say(sentence)
         stop.leave("The router was interrupted; its clients keep trying to reconnect.")
 
 

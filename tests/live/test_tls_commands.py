@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import signal
 import time
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -191,6 +192,15 @@ def test_an_error_of_tls_is_one_sentence(fleet):
     assert isinstance(done.exception, BusError)
     with pytest.raises(BusError, match=r"^There is no '\S+/nobody\.pem'; thermofleet bus keys makes it\.$"):
         raise done.exception
+
+
+def test_a_router_reports_its_links(fleet):
+    own = ("bus", "router", "--port", 0, "--tls", fleet.keys, "--connect")
+    with commands.ready(*own, fleet.address, "--connect", "tls/127.0.0.1:1") as (process, _):
+        assert process.stderr is not None
+        assert process.stderr.readline() == f"Linked to the router at {fleet.address}.\n"
+        assert "tls/127.0.0.1:1 (Connection refused)" in process.stderr.readline()
+        assert commands.end(process, signal.SIGTERM) == (0, "")
 
 
 def test_a_recorder_whose_certificate_expires_ends_with_an_error(fleet, tmp_path, monkeypatch):

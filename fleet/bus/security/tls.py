@@ -197,6 +197,20 @@ def why_not(host: str, port: int, tls: Tls | None) -> tuple[str, bool]:
     return reason, reason not in ("", _NO_REPLY)
 
 
+def server_name(host: str, port: int, tls: Tls) -> str:
+    """Common name in the certificate of a server, as `router:router_2`; "" if a handshake with it fails."""
+    with (
+        suppress(OSError),
+        socket.create_connection((host, port), timeout=_PROBE_S) as line,
+        tls.context().wrap_socket(line, server_hostname=host) as secure,
+    ):
+        subject = (secure.getpeercert() or {}).get("subject", ())
+        for ((field, value),) in cast(tuple[tuple[tuple[str, str]], ...], subject):
+            if field == "commonName":
+                return value
+    return ""
+
+
 def _why_not_plain(line: socket.socket) -> str:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
