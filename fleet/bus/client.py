@@ -194,12 +194,15 @@ class BusClient(Connection):
 
     @property
     def expiry(self) -> str:
-        """Sentence that its certificate has expired; "" if it has not, and without TLS."""
+        """Sentence that its certificate has expired; "" if it has not or was renewed meanwhile, and without TLS."""
+        if self._expires is not None and is_past(self._expires):
+            with suppress(BusError):  # missing while it is replaced
+                self._expires = expires_at(self._endpoint)
         if self._expires is None or not is_past(self._expires):
             return ""
         return (
             f"The certificate of '{self.participant}' expired on {self._expires:%Y-%m-%d %H:%M} UTC, so it has no "
-            "connection: renew it with thermofleet bus keys --add, and start this process again."
+            "connection until it is renewed with thermofleet bus keys --add --overwrite."
         )
 
     def close(self) -> None:
@@ -217,9 +220,7 @@ class BusClient(Connection):
 
         Returns how many it handled. Waking once for many messages costs much less than once for each.
         """
-        if not self._expiry_logged and (expiry := self.expiry):
-            self._expiry_logged = True
-            _LOG.error("%s", expiry)
+        self._log_expiry()
         handled = 0
         for handle, arguments in self._calls.take(until_s, count=at_least):
             handle(*arguments)
@@ -492,6 +493,16 @@ class BusClient(Connection):
             _LOG.warning("Dropped invalid message (%d %s so far): %s", count, alike, reason)
 
     # Inside
+
+    def _log_expiry(self) -> None:
+        """Log once that the certificate has expired, and that the connection is back with a renewed one."""
+        expiry = self.expiry
+        if expiry and not self._expiry_logged:
+            self._expiry_logged = True
+            _LOG.error("%s", expiry)
+        elif self._expiry_logged and not expiry and self.connected:
+            self._expiry_logged = False
+            _LOG.warning("The certificate of '%s' was renewed, and it is connected again.", self.participant)
 
     def _check(self, action: Action, key: str) -> None:
         if objection := self.objection(action, key):

@@ -228,7 +228,7 @@ def record_command(
     kept = sum(count.kept for count in recorder.counts.values())
     say(f"Recorded {kept} messages in {out}, {missed} missed.", out_console)
     if expiry := link.expiry:
-        raise BusError(f"Nothing has been recorded since the certificate expired. {expiry}")
+        raise BusError(f"Nothing has been recorded since the certificate expired. {expiry} Then start it again.")
     stop.leave("All that was received is on disk; the same command continues the recording.")
 
 

@@ -152,7 +152,7 @@ def test_a_line_ends_with_its_certificate(folder, guarded, tmp_path):
         watch.undeclare()
 
 
-def test_a_client_reports_that_its_certificate_has_expired(folder, guarded, tmp_path, caplog):
+def test_a_client_reports_that_its_certificate_has_expired_and_was_renewed(folder, guarded, tmp_path, caplog):
     place = rogue_folder(tmp_path / "k", folder, "good")
     soon = datetime.now(UTC) + timedelta(seconds=2.0)
     issue(place, RosterEntry("arm_0", "arm"), days=1, now=soon - timedelta(days=1))
@@ -162,7 +162,11 @@ def test_a_client_reports_that_its_certificate_has_expired(folder, guarded, tmp_
         arm.serve()
         arm.serve()
         assert arm.expiry.startswith(f"The certificate of 'arm_0' expired on {soon:%Y-%m-%d %H:%M} UTC")
-    assert [each.levelname for each in caplog.records if each.getMessage() == arm.expiry] == ["ERROR"]
+        assert [each.levelname for each in caplog.records if each.getMessage() == arm.expiry] == ["ERROR"]
+        issue(place, RosterEntry("arm_0", "arm"), days=30)
+        again = "The certificate of 'arm_0' was renewed, and it is connected again."
+        wait_until(lambda: again in caplog.text, arm.serve)
+        assert (arm.connected, arm.expiry) == (True, "")
 
 
 def test_a_key_that_others_may_read_is_not_used(folder, tmp_path, guarded):
