@@ -22,7 +22,7 @@ from fleet.bus.protocol.messages import MOST_BYTES
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES
 from fleet.bus.security.access_control import ROSTER, Roster, RosterEntry, access_control, read_roster
 from fleet.bus.security.tls import Tls, identified, participant_at, server_name, why_not
-from fleet.errors import BusError, NoRouter
+from fleet.errors import BusError, NoRouter, StoppedWaiting
 
 _LOG = logging.getLogger(__name__)
 
@@ -191,7 +191,7 @@ class Connection(Session):
                 if not waits:
                     _LOG.warning("Waiting for a router. %s", error)
                 waits = True
-        raise NoRouter(f"Stopped while waiting for a router at {self._endpoint}.")
+        raise StoppedWaiting(f"Stopped while waiting for a router at {self._endpoint}.")
 
 
 def open_client(endpoint: str, *, timeout_s: float, tls: Tls | None = None) -> zenoh.Session:

@@ -61,6 +61,16 @@ def test_a_router_prints_its_endpoint_and_exits_on_a_signal(number, code):
         assert "Traceback" not in err
 
 
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+@pytest.mark.parametrize("words", ["record f --out r", "watch", "ros2 bridge --fleet f", "gateway --fleet f --port 0"])
+def test_a_process_that_waits_for_a_router_exits_on_a_signal(tmp_path, words, number, code):
+    with commands.start("bus", *words.split(), "--endpoint", "tcp/127.0.0.1:1", cwd=tmp_path) as process:
+        assert "Waiting for a " in process.stderr.readline()
+        returned, errors = commands.end(process, number)
+    assert returned == code
+    assert re.fullmatch(r"Stopped while waiting for a .* at tcp/127\.0\.0\.1:1\.\n" if code else "", errors)
+
+
 def test_a_router_with_tls_enforces_access_and_the_state_rate(folder):
     options = ("--port", 0, "--tls", folder, "--scenario", "quickstart", "--state-hz", 5)
     with commands.ready("bus", "router", *options) as (process, endpoint):
