@@ -74,12 +74,16 @@ def test_nobody_gets_in_without_a_certificate(open_stranger, guarded, folder):
     [
         ("nodir/monitor", r"There is no '.*nodir/monitor\.pem'; thermofleet bus keys makes it\."),
         ("f/nobody", r"There is no '.*f/nobody\.pem'; thermofleet bus keys makes it\."),
+        ("f/monitor.pem", r"There is no '.*f/monitor\.pem\.pem'; leave the ending out: '.*f/monitor'\."),
+        ("f/arm_0.key", r"leave the ending out: '.*f/arm_0'\."),
+        ("elsewhere/nobody", r"nobody\.pem'; copy it from the machine that has ca\.key, where thermofleet bus keys ma"),
         ("f", r"There is no '.*/f\.pem'; name a participant of the folder, as '.*/f/monitor'\."),
         ("f/", r"There is no '.*/f\.pem'; name a participant of the folder, as '.*/f/monitor'\."),
         ("f/..", r"names no participant\. Expected tls/127\.0\.0\.1:\d+#FOLDER/NAME\."),
     ],
 )
 def test_a_wrong_path_of_a_certificate_is_named_by_whoever_uses_the_endpoint(guarded, folder, participant, reason):
+    (folder.parent / "elsewhere").mkdir(exist_ok=True)
     endpoint = f"{guarded.endpoint}#{folder.parent}/{participant}"
     for use in (fleets_at, lambda endpoint: BusClient(endpoint, "f").open()):
         with pytest.raises(BusError, match=reason):

@@ -27,7 +27,7 @@ from fleet.errors import FleetError
 from fleet.live.arm.awards import ArmRecord, Closed
 from fleet.live.journal import Journal
 from scenarios.cli.main import main
-from scenarios.live.fleet_processes import chosen_arms, free_port, parts_of
+from scenarios.live.fleet_processes import chosen_arms, free_port, how_to_watch, parts_of
 from scenarios.live.gateway import ROLES, check, check_token, permitted_role, read_tokens, run_gateway
 from scenarios.spec.options import LiveSpec
 from tests import commands
@@ -230,6 +230,31 @@ def test_up_gives_every_process_its_own_certificate_and_the_router_here_or_elsew
     assert router.argv[router.argv.index("--host") + 1] == "0.0.0.0"
     assert router.ready == "tls/127.0.0.1:7447"
     assert parts_of("quickstart", names, spec, host="fd00::1", **options)[0].ready == "tls/[fd00::1]:7447"
+
+
+def test_a_part_of_a_fleet_that_waits_for_its_router_says_so_and_is_not_up(small_toml, tmp_path):
+    elsewhere = ("--arms", "left", "--router", "tcp/127.0.0.1:1", "--difficulty", "blind")
+    with commands.start("up", small_toml, *elsewhere, "--out", tmp_path / "out") as process:
+        assert process.stderr is not None
+        while "'arm-left': Waiting for a router. No router answered" not in process.stderr.readline():
+            assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, out) == (130, "")
+    assert err.startswith("Stopping all processes in order")
+
+
+def test_the_command_to_watch_names_a_certificate_that_is_there(folder):
+    at = "tls/cell-1:7447"
+    command = f"thermofleet bus watch --scenario quickstart --endpoint {at}#{folder}/"
+    assert how_to_watch("quickstart", at, folder) == f"To watch it: {command}monitor"
+    (folder / "monitor.key").unlink()
+    assert how_to_watch("quickstart", at, folder) == f"To watch it: {command}operator"
+    for name in ("operator", "submitter", "gateway", "recorder"):
+        (folder / f"{name}.key").unlink(missing_ok=True)
+    sentence = f"To watch it, copy monitor.pem and monitor.key to {folder}: {command}monitor"
+    assert how_to_watch("quickstart", at, folder) == sentence
+    assert how_to_watch("quickstart", PLAIN, None).endswith(f"--endpoint {PLAIN}")
 
 
 def reports(folder):

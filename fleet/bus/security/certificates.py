@@ -213,11 +213,20 @@ def _bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except FileNotFoundError as error:
-        folder = path.with_suffix("")
-        hint = f"name a participant of the folder, as '{folder / 'monitor'}'" if folder.is_dir() else ""
-        raise BusError(f"There is no '{path}'; {hint or 'thermofleet bus keys makes it'}.") from error
+        raise BusError(f"There is no '{path}'; {_how_to_get(path)}.") from error
     except OSError as error:
         raise BusError(f"Cannot read '{path}': {error.strerror}.") from error
+
+
+def _how_to_get(path: Path) -> str:
+    named = path.with_suffix("")
+    if named.is_dir():
+        return f"name a participant of the folder, as '{named / 'monitor'}'"
+    if named.suffix in (".pem", ".key"):
+        return f"leave the ending out: '{named.with_suffix('')}'"
+    if path.parent.is_dir() and path.name != f"{CA}.key" and not (path.parent / f"{CA}.key").exists():
+        return f"copy it from the machine that has {CA}.key, where thermofleet bus keys makes it"
+    return "thermofleet bus keys makes it"
 
 
 def _read_key(folder: Path, file: str) -> ec.EllipticCurvePrivateKey:
