@@ -238,7 +238,10 @@ def replay_command(
     fleet: str | None = option("Name of the fleet. Default: that of the recording.", None),
     speed: float = option("Recorded seconds per real second.", 1.0, low=0, high=MAX_SPEED, above=True),
 ) -> None:
-    """Publish a run or a recording on the bus, in real time or at --speed; needs a router without TLS."""
+    """Publish a run or a recording on the bus, in real time or at --speed; needs a router without TLS.
+
+    It begins with the first state: messages of a time before it are published at once.
+    """
     from fleet.bus.client import BusClient
     from scenarios.live.recording import STATE_GAP_S, open_messages, replay
     from scenarios.signals import until_stopped
@@ -253,6 +256,8 @@ def replay_command(
         echo(f"ready replay {endpoint}")
         count = replay(messages, link, connect=connect, speed=speed, stopped=stop.is_set)
     say(f"Published {count.published} of {len(messages)} messages.", out_console)
+    if count.early:
+        say(f"{count.early} of them were of a time before the first state and were published at once.", out_console)
     if count.left_out:
         say(
             f"Left out {count.left_out} states that were due less than {1000 * STATE_GAP_S:.0f} ms after the one "
