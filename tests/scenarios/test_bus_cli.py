@@ -202,6 +202,41 @@ def test_keys_are_made_shown_and_extended(thermofleet, folder):
     assert "(authority)" in out
 
 
+def test_a_folder_with_some_of_the_keys_is_shown_and_extended(thermofleet, folder):
+    for name in ("router.pem", "router.key"):
+        (folder / name).unlink()
+    before = (folder / "arm_0.pem").read_bytes()
+    code, out, err = thermofleet("bus", "keys", folder, "--add", "arm_0:arm", "--overwrite")
+    assert code == 0
+    assert "restart the routers" not in err  # the roster is the same
+    assert "restart the routers" in " ".join(thermofleet("bus", "keys", folder, "--add", "arm_9:arm")[2].split())
+    assert (folder / "arm_0.pem").read_bytes() != before
+    rows = dict(line.split(maxsplit=1) for line in out.splitlines()[2:])
+    assert rows["router"].split(maxsplit=1)[1].rstrip() == "not in this folder"
+    told = json.loads(thermofleet("bus", "keys", folder, "--json")[1])
+    assert [one["name"] for one in told["participants"] if one["ends"] is None] == ["router"]
+
+
+def test_a_damaged_certificate_is_refused_before_another_is_replaced(thermofleet, folder):
+    (folder / "router.pem").write_text("")
+    before = (folder / "arm_0.pem").read_bytes()
+    words = ("bus", "keys", folder, "--overwrite", "--add")
+    assert thermofleet(*words, "arm_0:arm").refused("router.pem' is not a certificate")
+    assert (folder / "arm_0.pem").read_bytes() == before
+    assert thermofleet(*words, "arm_0:arm", "--add", "router:router")[0] == 0
+
+
+def test_a_key_that_cannot_be_used_is_listed(thermofleet, folder):
+    (folder / "arm_0.key").chmod(0o640)
+    (folder / "ca.key").chmod(0o604)
+    (folder / "arm_1.key").unlink()
+    (folder / "arm_1.key").mkdir()
+    rows = dict(line.split(maxsplit=1) for line in thermofleet("bus", "keys", folder)[1].splitlines()[1:])
+    endings = {"arm_0": ", key readable by others", "arm_1": ", key is no file", "arm_2": "UTC"}
+    for name, ending in (endings | {"(authority)": endings["arm_0"]}).items():
+        assert rows[name].rstrip().endswith(ending), name
+
+
 def test_the_hosts_of_a_new_certificate_of_a_router_are_named(thermofleet, folder):
     renew = ("bus", "keys", folder, "--add", "router:router", "--overwrite")
     for hosts, named in ((["cell-1", "10.0.0.7"], ", cell-1, 10.0.0.7"), ([], "")):

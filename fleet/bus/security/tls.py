@@ -47,7 +47,7 @@ class Tls:
             BusError: a file is missing, damaged, expired or of another authority, or the key is readable by others.
         """
         # Imported late: plain TCP does not need the library.
-        from fleet.bus.security.certificates import check, common_name, format_time
+        from fleet.bus.security.certificates import check, common_name, format_time, readable_by_others
 
         certificate = check(self.folder, self.file)
         owner = common_name(certificate)
@@ -55,7 +55,7 @@ class Tls:
             needs = "a router needs that of a router" if serves else "only the router may use it"
             raise BusError(f"'{self.folder / self.file}.pem' is the certificate of '{owner}'; {needs}.")
         key = self._path(f"{self.file}.key")
-        if os.name == "posix" and key.stat().st_mode & 0o077:
+        if readable_by_others(key):
             raise BusError(f"Others on this machine may read the private key '{key}': chmod 600 it.")
         expires = certificate.not_valid_after_utc
         if expires - datetime.now(UTC) < REMIND:
