@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import shutil
 import signal
 import time
 from contextlib import contextmanager
@@ -191,6 +192,16 @@ def test_an_error_of_tls_is_one_sentence(fleet):
     done = run("doctor", f"{fleet.address}#{fleet.keys}/nobody")
     assert isinstance(done.exception, BusError)
     with pytest.raises(BusError, match=r"^There is no '\S+/nobody\.pem'; thermofleet bus keys makes it\.$"):
+        raise done.exception
+
+
+@pytest.mark.parametrize("command", ["bus watch", "bus watch --json", "bus doctor", "job list"])
+def test_without_a_roster_the_fleet_has_to_be_named(fleet, tmp_path, command):
+    for file in ("ca.pem", "monitor.pem", "monitor.key"):
+        shutil.copy(fleet.keys / file, tmp_path)
+    done = CliRunner().invoke(app, [*command.split(), "--endpoint", f"{fleet.address}#{tmp_path}/monitor"])
+    assert isinstance(done.exception, FleetError)
+    with pytest.raises(FleetError, match=r"^With TLS nobody may list the fleets .* name the fleet with --fleet\.$"):
         raise done.exception
 
 
