@@ -240,6 +240,15 @@ class BusClient(Connection):
         """Why the router would drop this, by the role of the certificate; "" if it would not, and without TLS."""
         return "" if self._participant is None else _objection(self.fleet, self._participant, action, key)
 
+    def require(self, action: Action, key: str) -> None:
+        """Refuse an action that the certificate does not allow.
+
+        Raises:
+            BusError: as `objection`.
+        """
+        if objection := self.objection(action, key):
+            raise BusError(objection)
+
     def publisher(self, key: str, kind: type[Message], *, check: bool = True) -> Callable[[Message], None]:
         """A function that publishes messages under one key; late subscribers get the history that the registry sets.
 
@@ -251,7 +260,7 @@ class BusClient(Connection):
         """
         channel, settings = _transport(key, "publish", kind)
         if check:
-            self._check("publish", key)
+            self.require("publish", key)
         publisher = advanced.declare_advanced_publisher(
             self._open(),
             key,
@@ -266,13 +275,13 @@ class BusClient(Connection):
     def publish(self, key: str, message: msgspec.Struct) -> None:
         """Publish one message to the present subscribers, without history; raises as `publisher`."""
         _, settings = _transport(key, "publish", type(message))
-        self._check("publish", key)
+        self.require("publish", key)
         self._open().put(key, encode(message), **settings)
 
     def declare_token(self, key: str) -> None:
         """Show a liveliness token until this client is closed or loses its connection; raises as `publisher`."""
         channel_for(key, "token")
-        self._check("show the token", key)
+        self.require("show the token", key)
         self._keep(self._open().liveliness().declare_token(key))
 
     # Querying
@@ -303,7 +312,7 @@ class BusClient(Connection):
         channel, settings = _transport(key, "query", type(request))
         if channel.reply is not kind:
             raise ValueError(f"'{key}' is answered with {channel.reply}, not with {kind}.")
-        self._check("query", key)
+        self.require("query", key)
         payload = encode(request)
         if len(payload) > MOST_BYTES and channel.role != "policy":
             self.post(done, Replies(refused={key: _too_large(len(payload))}, took_s=0.0))
@@ -393,7 +402,7 @@ class BusClient(Connection):
             BusError: the client is not open, or its certificate does not allow it.
         """
         channel_for(key, "query", kind)
-        self._check("reply to", key)
+        self.require("reply to", key)
         receive = _direct(partial(self._receive, key, kind, handle))
         self._keep(self._open().declare_queryable(key, receive, complete=True))
 
@@ -503,10 +512,6 @@ class BusClient(Connection):
         elif self._expiry_logged and not expiry and self.connected:
             self._expiry_logged = False
             _LOG.warning("The certificate of '%s' was renewed, and it is connected again.", self.participant)
-
-    def _check(self, action: Action, key: str) -> None:
-        if objection := self.objection(action, key):
-            raise BusError(objection)
 
     def _token(self, key: str, present: bool, handle: Callable[[str, bool], None]) -> None:
         try:

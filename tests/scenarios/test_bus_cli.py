@@ -202,6 +202,23 @@ def test_keys_are_made_shown_and_extended(thermofleet, folder):
     assert "(authority)" in out
 
 
+def test_a_certificate_is_checked_before_the_name_is_sought_on_the_bus(thermofleet, small_toml, tmp_path):
+    """Both names are present, which is no reason to stop them if the certificate is of another participant."""
+    place = tmp_path / "keys"
+    assert thermofleet("bus", "keys", place, small_toml)[0] == 0
+    with Router(tls=Tls(place, "router")) as router, ExitStack() as stack:
+        at = {name: f"{router.endpoint}#{place}/{name}" for name in ("left", "right", "auctioneer", "submitter")}
+        tokens = {"left": keys.of_arm("heat", "left", "alive")}
+        tokens["auctioneer"] = keys.of_auction("heat", "auctioneer", "alive")
+        for name, token in tokens.items():
+            stack.enter_context(BusClient(at[name], "heat")).declare_token(token)
+        arm = ("arm", "run", small_toml, "left", "--difficulty", "blind", "--journal", tmp_path / "run")
+        needed = "a certificate of the role arm and the name 'left'"
+        assert thermofleet(*arm, "--endpoint", at["right"]).refused(needed)
+        auction = ("bus", "auctioneer", small_toml, "--journal", tmp_path / "run", "--endpoint", at["submitter"])
+        assert thermofleet(*auction).refused("a certificate of the role auctioneer and the name 'auctioneer'")
+
+
 def test_a_folder_with_some_of_the_keys_is_shown_and_extended(thermofleet, folder):
     for name in ("router.pem", "router.key"):
         (folder / name).unlink()
