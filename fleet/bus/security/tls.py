@@ -181,7 +181,7 @@ def is_past(moment: datetime) -> bool:
     return datetime.now(UTC) >= moment
 
 
-_NO_REPLY = "the server does not use TLS: no reply to the handshake"
+_NO_REPLY = "no reply to the TLS handshake: the server is suspended or overloaded, or does not use TLS"
 
 
 def why_not(host: str, port: int, tls: Tls | None) -> tuple[str, bool]:
