@@ -319,8 +319,10 @@ def ros2_command(
     given: Annotated[Given, From(options.Ros2Spec)],
 ) -> None:
     """Connect a fleet to ROS 2 over Zenoh (rmw_zenoh), until Ctrl-C or SIGTERM; needs the extra `ros2`."""
-    if (mode == "listen") != bool(topic):
-        raise FleetError(f"Only listen takes a TOPIC, and needs one (got {mode} {topic}".rstrip() + ").")
+    if mode == "listen" and not topic:
+        raise FleetError("listen needs the TOPIC of the arm's sensor_msgs/JointState, as /joint_states.")
+    if topic and mode != "listen":
+        raise FleetError(f"{mode} takes no TOPIC, as listen does: leave '{topic}' out.")
     from scenarios.live.ros2 import run_bridge, run_jobs, run_listener
 
     run = {"bridge": run_bridge, "listen": partial(run_listener, topic), "jobs": run_jobs}[mode]

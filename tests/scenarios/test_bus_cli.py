@@ -148,6 +148,8 @@ SEVERAL_MACHINES = {
     "--host 0.0.0.0": "needs --tls",
 }
 ROS2 = {
+    "listen": "listen needs the TOPIC of the arm's sensor_msgs/JointState",
+    "bridge /joint_states": "bridge takes no TOPIC, as listen does: leave '/joint_states' out",
     "listen /joint_states": "has no motor temperatures",
     "listen /j --temperatures /d --joints a,a": "different names",
     "jobs": "needs the Python module 'rclpy' of ROS 2",
