@@ -75,9 +75,7 @@ def keys_command(
     if scenario or add:
         say(f"Keys of the fleet '{roster.fleet}' are in {folder}. Keep {folder / 'ca.key'} where no participant runs.")
     if any(one not in before or one.role == "router" for one in added):
-        say(
-            f"Copy {folder / ROSTER} to each machine that has one and restart the routers: they read it when they start."
-        )
+        say(f"Copy {folder / ROSTER} to machines that have one and restart the routers: they read it when they start.")
     for one in roster.participants if scenario else added:
         if one.role == "router":
             valid = ", ".join(hosts_of(read(folder, one.file)))
