@@ -46,6 +46,10 @@ class NoRouter(BusError):
     """No router replies; one may start later."""
 
 
+class StoppedWaiting(NoRouter):
+    """Stopped by a signal, as was asked, before there was a router or a fleet."""
+
+
 class IdentificationError(FleetError):
     """Recordings do not determine an arm's thermal parameters; the message states what to record."""
 

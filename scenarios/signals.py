@@ -6,6 +6,7 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from fleet.errors import StoppedWaiting
 from fleet.live.supervisor import exit_with_supervisor
 from scenarios.terminal import Interrupted
 
@@ -44,7 +45,11 @@ class StopRequest:
 
 @contextmanager
 def until_stopped() -> Iterator[StopRequest]:
-    """Turn Ctrl-C and SIGTERM into stop requests. Call it in the main thread."""
+    """Turn Ctrl-C and SIGTERM into stop requests. Call it in the main thread.
+
+    Raises:
+        Interrupted: Ctrl-C while the block waited for a router or a fleet; SIGTERM then ends the process with code 0.
+    """
     exit_with_supervisor()
     receiver, sender = socket.socketpair()
     with receiver, sender:
@@ -54,6 +59,9 @@ def until_stopped() -> Iterator[StopRequest]:
         stop = StopRequest(receiver)
         try:
             yield stop
+        except StoppedWaiting as error:
+            stop.leave(str(error))
+            raise SystemExit(0) from error
         finally:
             stop.is_set()
             for number, handler in zip(NUMBERS, before, strict=True):

@@ -8,9 +8,10 @@ malformed message is counted and logged, and never raises; a malformed request i
 
 import logging
 import math
+import re
 import threading
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -45,6 +46,10 @@ MOST_REPLIES = 1024
 """Replies to one query that are read: one of each arm of the largest fleet."""
 MOST_REJECTIONS, MOST_CHARACTERS = 1024, 2048
 """Places whose last malformed message is kept (a state of each arm of the largest fleet); length of a kept reason."""
+MOST_COUNTED = 256
+"""Reasons whose messages are counted one by one for the log; those of all others are counted together."""
+_DECIMAL = re.compile(r"\d+\.\d+")
+"""A measured value, which differs from one reason to the next of the same fault."""
 
 Action = Literal["publish", "show the token", "reply to", "query"]
 """What a certificate may or may not allow under a key."""
@@ -159,6 +164,8 @@ class BusClient(Connection):
         self.fleet = fleet
         self.malformed = 0
         self.rejections: OrderedDict[str, tuple[str, float]] = OrderedDict()
+        self._rejected: Counter[str] = Counter()
+        """Number of malformed messages by place and reason; of those beyond `MOST_COUNTED` under ""."""
         self.overrun = 0
         self._calls: Mailbox[tuple[Callable[..., None], tuple[Any, ...]]] = Mailbox(backlog)
         self._participant: RosterEntry | None = None
@@ -187,12 +194,15 @@ class BusClient(Connection):
 
     @property
     def expiry(self) -> str:
-        """Sentence that its certificate has expired; "" if it has not, and without TLS."""
+        """Sentence that its certificate has expired; "" if it has not or was renewed meanwhile, and without TLS."""
+        if self._expires is not None and is_past(self._expires):
+            with suppress(BusError):  # missing while it is replaced
+                self._expires = expires_at(self._endpoint)
         if self._expires is None or not is_past(self._expires):
             return ""
         return (
             f"The certificate of '{self.participant}' expired on {self._expires:%Y-%m-%d %H:%M} UTC, so it has no "
-            "connection: renew it with thermofleet bus keys --add, and start this process again."
+            "connection until it is renewed with thermofleet bus keys --add --overwrite."
         )
 
     def close(self) -> None:
@@ -210,9 +220,7 @@ class BusClient(Connection):
 
         Returns how many it handled. Waking once for many messages costs much less than once for each.
         """
-        if not self._expiry_logged and (expiry := self.expiry):
-            self._expiry_logged = True
-            _LOG.error("%s", expiry)
+        self._log_expiry()
         handled = 0
         for handle, arguments in self._calls.take(until_s, count=at_least):
             handle(*arguments)
@@ -232,6 +240,15 @@ class BusClient(Connection):
         """Why the router would drop this, by the role of the certificate; "" if it would not, and without TLS."""
         return "" if self._participant is None else _objection(self.fleet, self._participant, action, key)
 
+    def require(self, action: Action, key: str) -> None:
+        """Refuse an action that the certificate does not allow.
+
+        Raises:
+            BusError: as `objection`.
+        """
+        if objection := self.objection(action, key):
+            raise BusError(objection)
+
     def publisher(self, key: str, kind: type[Message], *, check: bool = True) -> Callable[[Message], None]:
         """A function that publishes messages under one key; late subscribers get the history that the registry sets.
 
@@ -243,7 +260,7 @@ class BusClient(Connection):
         """
         channel, settings = _transport(key, "publish", kind)
         if check:
-            self._check("publish", key)
+            self.require("publish", key)
         publisher = advanced.declare_advanced_publisher(
             self._open(),
             key,
@@ -258,13 +275,13 @@ class BusClient(Connection):
     def publish(self, key: str, message: msgspec.Struct) -> None:
         """Publish one message to the present subscribers, without history; raises as `publisher`."""
         _, settings = _transport(key, "publish", type(message))
-        self._check("publish", key)
+        self.require("publish", key)
         self._open().put(key, encode(message), **settings)
 
     def declare_token(self, key: str) -> None:
         """Show a liveliness token until this client is closed or loses its connection; raises as `publisher`."""
         channel_for(key, "token")
-        self._check("show the token", key)
+        self.require("show the token", key)
         self._keep(self._open().liveliness().declare_token(key))
 
     # Querying
@@ -295,7 +312,7 @@ class BusClient(Connection):
         channel, settings = _transport(key, "query", type(request))
         if channel.reply is not kind:
             raise ValueError(f"'{key}' is answered with {channel.reply}, not with {kind}.")
-        self._check("query", key)
+        self.require("query", key)
         payload = encode(request)
         if len(payload) > MOST_BYTES and channel.role != "policy":
             self.post(done, Replies(refused={key: _too_large(len(payload))}, took_s=0.0))
@@ -385,7 +402,7 @@ class BusClient(Connection):
             BusError: the client is not open, or its certificate does not allow it.
         """
         channel_for(key, "query", kind)
-        self._check("reply to", key)
+        self.require("reply to", key)
         receive = _direct(partial(self._receive, key, kind, handle))
         self._keep(self._open().declare_queryable(key, receive, complete=True))
 
@@ -463,7 +480,7 @@ class BusClient(Connection):
         return {place: reason for place, (reason, at_s) in self.rejections.items() if at_s >= since_s}
 
     def reject(self, place: str, error: object) -> None:
-        """Count and log a malformed message.
+        """Count a malformed message; the log has the first, second, fourth, … one of each place and reason.
 
         Args:
             place: Where it was, for example `under`; `rejections` keeps the last one of each.
@@ -475,14 +492,26 @@ class BusClient(Connection):
         self.rejections.move_to_end(place)
         if len(self.rejections) > MOST_REJECTIONS:
             self.rejections.popitem(last=False)
-        if self.malformed & (self.malformed - 1) == 0:  # 1, 2, 4, 8, …: a flood of messages must not flood the log
-            _LOG.warning("Dropped invalid message (%d so far): %s", self.malformed, reason)
+        fault = _DECIMAL.sub("", reason[:MOST_CHARACTERS])
+        if fault not in self._rejected and len(self._rejected) >= MOST_COUNTED:
+            fault = ""
+        self._rejected[fault] += 1
+        count = self._rejected[fault]
+        if count & (count - 1) == 0:  # 1, 2, 4, 8, …: a flood of messages must not flood the log
+            alike = "like this" if fault else "of other kinds"
+            _LOG.warning("Dropped invalid message (%d %s so far): %s", count, alike, reason)
 
     # Inside
 
-    def _check(self, action: Action, key: str) -> None:
-        if objection := self.objection(action, key):
-            raise BusError(objection)
+    def _log_expiry(self) -> None:
+        """Log once that the certificate has expired, and that the connection is back with a renewed one."""
+        expiry = self.expiry
+        if expiry and not self._expiry_logged:
+            self._expiry_logged = True
+            _LOG.error("%s", expiry)
+        elif self._expiry_logged and not expiry and self.connected:
+            self._expiry_logged = False
+            _LOG.warning("The certificate of '%s' was renewed, and it is connected again.", self.participant)
 
     def _token(self, key: str, present: bool, handle: Callable[[str, bool], None]) -> None:
         try:

@@ -8,6 +8,7 @@ import ipaddress
 import json
 import logging
 import re
+import socket
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
@@ -19,9 +20,9 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.keys import SESSION_LEASE_S
 from fleet.bus.protocol.messages import MOST_BYTES
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES
-from fleet.bus.security.access_control import ROSTER, Roster, access_control, read_roster
-from fleet.bus.security.tls import Tls, identified, participant_at, why_not
-from fleet.errors import BusError, NoRouter
+from fleet.bus.security.access_control import ROSTER, Roster, RosterEntry, access_control, read_roster
+from fleet.bus.security.tls import Tls, identified, participant_at, server_name, why_not
+from fleet.errors import BusError, NoRouter, StoppedWaiting
 
 _LOG = logging.getLogger(__name__)
 
@@ -190,7 +191,7 @@ class Connection(Session):
                 if not waits:
                     _LOG.warning("Waiting for a router. %s", error)
                 waits = True
-        raise NoRouter(f"Stopped while waiting for a router at {self._endpoint}.")
+        raise StoppedWaiting(f"Stopped while waiting for a router at {self._endpoint}.")
 
 
 def open_client(endpoint: str, *, timeout_s: float, tls: Tls | None = None) -> zenoh.Session:
@@ -277,6 +278,8 @@ class Router(Session):
                 "Start both with --tls."
             )
         self._connect = [reachable(endpoint, tls) for endpoint in connect]
+        self._reported: dict[str, str] = {}
+        """Last result of `_link_fault` by endpoint."""
         self._endpoint = ""
 
     @property
@@ -306,6 +309,36 @@ class Router(Session):
     def linked(self) -> int:
         """Number of other routers that it has a link to now."""
         return 0 if self._session is None else len(self._session.info.routers_zid())
+
+    def link_changes(self) -> list[str]:
+        """A sentence on each link of `connect` that is there, or is missing, otherwise than at the last call.
+
+        A missing one is tried with a handshake for the reason, which may take seconds.
+        """
+        sentences: list[str] = []
+        for endpoint in self._connect:
+            fault = self._link_fault(endpoint)
+            if self._reported.get(endpoint) != fault:
+                self._reported[endpoint] = fault
+                missing = f"No link to the router at {endpoint} ({fault}). It is tried again every second."
+                sentences.append(missing if fault else f"Linked to the router at {endpoint}.")
+        return sentences
+
+    def _link_fault(self, endpoint: str) -> str:
+        """Why there is no link to the router at an endpoint; "" if there is one."""
+        assert self._tls is not None  # as for every link
+        host, port = _address(endpoint)
+        links = self._open().info.links()
+        if {str(link.dst) for link in links} & _locators(host, port):
+            return ""
+        # The other router may have opened the link, or have several addresses: it is recognised by its certificate.
+        name = server_name(host, port, self._tls)
+        if name and name in {link.auth_identifier for link in links}:
+            return ""
+        if name == RosterEntry(self._tls.name, "router").common_name:
+            return "it is the address of this router, or of another one with the same certificate"
+        reason, _ = why_not(host, port, self._tls)
+        return reason or "it accepts the certificate, and the link is not open yet"
 
     def _settings(self) -> zenoh.Config:
         roster = None
@@ -397,6 +430,15 @@ def _address(endpoint: str) -> tuple[str, int]:
     """Host and port of a valid endpoint."""
     host, port = endpoint[len("tcp/") :].rsplit(":", 1)
     return host.strip("[]"), int(port)
+
+
+def _locators(host: str, port: int) -> set[str]:
+    """Zenoh's names for the ends of a TLS link to a host."""
+    try:
+        addresses = {str(address[0]) for *_, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)}
+    except OSError:
+        return set()
+    return {f"tls/[{address}]:{port}" if ":" in address else f"tls/{address}:{port}" for address in addresses}
 
 
 def plain_reason(error: zenoh.ZError) -> str:

@@ -27,6 +27,8 @@ SUPERVISED = "THERMOFLEET_SUPERVISOR"
 """Environment variable of supervised processes: the process id of the supervisor."""
 WAITS = 75
 """Exit code of a process that waits for another, as a router: no failure (EX_TEMPFAIL of sysexits.h)."""
+NOTICES, NOTICE_S = ("Waiting for a router.", "The certificate of '"), 60.0
+"""Starts of log messages of a process that are also logged here: it is cut off. Real seconds before one is repeated."""
 LOG_S = 1.0
 """Real seconds to wait for the last output of an exited process."""
 
@@ -128,6 +130,8 @@ class Supervisor:
         self._backoff, self._patience_s = backoff or Backoff(), patience_s
         self._program, self._main = tuple(program), main
         self._parts: dict[str, _Running] = {}
+        self._noticed_s: dict[str, float] = {}
+        """When each message of `NOTICES` was logged; many processes may wait for the same router."""
         self._ended: Mailbox[str] = Mailbox()
 
     def start(self, part: Part, *, ready_s: float | None = None) -> None:
@@ -285,8 +289,15 @@ class Supervisor:
         with process.stdout as output:
             for line in output:
                 log.write(line)
+                self._notice(running.part.name, line)
                 if line.startswith(running.part.ready) and running.process is process:
                     running.ready.set()
+
+    def _notice(self, name: str, line: str) -> None:
+        message, now_s = line.partition(": ")[2].strip(), time.monotonic()
+        if message.startswith(NOTICES) and now_s >= self._noticed_s.get(message, -NOTICE_S) + NOTICE_S:
+            self._noticed_s[message] = now_s
+            _LOG.warning("'%s': %s", name, message)
 
     def _await_exit(self, running: _Running, process: "subprocess.Popen[str]") -> None:
         """Note the exit of a process, also if one that it has started still holds its output open."""

@@ -215,7 +215,7 @@ def _fastest(recent: Sequence[tuple[Joints, float]]) -> float:
     now = recent[-1][0]
     if now.qd:
         return max(map(abs, now.qd))
-    if len(recent) < 2 or not all(joints.q for joints, _ in recent):
+    if len(recent) < 2:
         return 0.0
     stamps = np.array([joints.time_s for joints, _ in recent])
     at_s = stamps if (np.diff(stamps) > 0).all() else np.array([real_s for _, real_s in recent])
@@ -284,7 +284,10 @@ class Follower:
             if topic.kind == JOINT_STATE:
                 self._readings.update_joints(read_joints(payload), now_s)
             else:
-                temp_c = temperatures(read_diagnostics(payload), self._readings.names, self._readings.hardware)
+                statuses = read_diagnostics(payload)
+                temp_c, faults = temperatures(statuses, self._readings.names, self._readings.hardware)
+                for fault in faults:
+                    self._link.reject(f"of {topic.name}", fault)
                 self._readings.update_temperatures(temp_c, now_s)
                 for sentence in self._readings.sensors.bad.values():
                     self._warn(f"sensor of {sentence[:7]}", f"has an impossible temperature: {sentence}; {BAD_SENSOR}.")
@@ -292,15 +295,16 @@ class Follower:
             self._link.reject(f"of {topic.name}", error)
 
     def _send_state(self, now_s: float) -> None:
-        self._tick += 1
         state = self._state(now_s)
         if state is None and now_s >= self._warn_from_s:
             self._warn("state", f"publishes no state: there is {self._readings.missing(now_s)}.")
         if state is not None:
+            self._tick = state.tick
             self._publish_state(self._with_scores(state, now_s))
 
     def _state(self, now_s: float) -> State | None:
-        return self._readings.state(self._arm, self._tick, self._clock.now_s(now_s), now_s, self._warning_c)
+        """The next state: only published ones count, as receivers take a gap in the ticks for lost states."""
+        return self._readings.state(self._arm, self._tick + 1, self._clock.now_s(now_s), now_s, self._warning_c)
 
     def _with_scores(self, state: State, now_s: float) -> State:
         """The state with what the monitor makes of the arm's motion, if the arm reports all that it needs."""

@@ -61,7 +61,7 @@ def in_order(joints: Joints, names: tuple[str, ...]) -> Joints | None:
     A velocity or effort that is NaN for every named joint counts as not measured: ros2_control writes so.
 
     Raises:
-        MalformedMessage: a joint is missing or named twice, or one of its values is not finite.
+        MalformedMessage: a joint is missing or named twice, it has no positions, or a value is not finite.
     """
     at = {name: index for index, name in enumerate(joints.names)}
     missing = [name for name in names if name not in at]
@@ -71,6 +71,8 @@ def in_order(joints: Joints, names: tuple[str, ...]) -> Joints | None:
         raise MalformedMessage(f"A JointState has {', '.join(sorted(at))}, but not {', '.join(missing)}.")
     if twice := [name for name in names if joints.names.count(name) > 1]:
         raise MalformedMessage(f"A JointState names {', '.join(twice)} twice.")
+    if not joints.q:
+        raise MalformedMessage(f"A JointState has no position of {', '.join(names)}.")
     selected: dict[str, tuple[float, ...]] = {}
     for field, ros_field in _FIELDS.items():
         values = getattr(joints, field)
@@ -135,29 +137,37 @@ def _number(value: float | None) -> str:
     return "unknown" if value is None else repr(value)
 
 
-def temperatures(diagnostics: Iterable[Diagnostic], names: tuple[str, ...], hardware: str) -> Mapping[str, float]:
-    """Motor temperatures by joint, °C, as far as the diagnostics have them.
+def temperatures(
+    diagnostics: Iterable[Diagnostic], names: tuple[str, ...], hardware: str
+) -> tuple[Mapping[str, float], tuple[str, ...]]:
+    """Motor temperatures by joint, °C, as far as the diagnostics have them, and a sentence on each unusable one.
 
     Args:
         hardware: Text before the joint's name in `hardware_id`, without the `/`; "" for none.
-
-    Raises:
-        MalformedMessage: a temperature is not a finite number.
     """
     wanted = {f"{hardware}/{name}" if hardware else name: name for name in names}
-    temp_c: dict[str, float] = {}
+    texts: dict[str, list[str]] = {}
     for status in diagnostics:
-        name = wanted.get(status.hardware)
-        text = dict(status.values).get(TEMPERATURE)
-        if name is None or text is None or status.level == STALE:
-            continue
-        try:
-            temp_c[name] = float(text)
-        except ValueError as error:
-            raise MalformedMessage(f"The {TEMPERATURE} of {status.hardware} is no number: '{text[:40]}'.") from error
-        if not isfinite(temp_c[name]):
-            raise MalformedMessage(f"The {TEMPERATURE} of {status.hardware} is {text}.")
-    return temp_c
+        if status.hardware in wanted and status.level != STALE:
+            texts.setdefault(status.hardware, []).extend(text for key, text in status.values if key == TEMPERATURE)
+    temp_c: dict[str, float] = {}
+    faults: list[str] = []
+    for joint, given in texts.items():
+        if len(given) > 1:
+            faults.append(f"A DiagnosticArray has {len(given)} values of {TEMPERATURE} of {joint}.")
+        elif given and not _is_finite(given[0]):
+            faults.append(f"The {TEMPERATURE} of {joint} is no number: '{given[0][:40]}'.")
+        elif given:
+            temp_c[wanted[joint]] = float(given[0])
+    return temp_c, tuple(faults)
+
+
+_NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
+"""As a temperature is written; `float` also reads `4_1.5`, `nan` and digits of other scripts."""
+
+
+def _is_finite(text: str) -> bool:
+    return _NUMBER.fullmatch(text) is not None and isfinite(float(text))
 
 
 def plain_name(name: str) -> str:

@@ -7,7 +7,7 @@ from typing import get_args
 
 import typer
 
-from fleet.bus.security.access_control import ROLES, Role, Roster, RosterEntry, of_arms, read_roster, rights
+from fleet.bus.security.access_control import ROLES, ROSTER, Role, Roster, RosterEntry, of_arms, read_roster, rights
 from fleet.errors import FleetError, nearest
 from fleet.fields import argument, option
 from scenarios.cli import options
@@ -60,16 +60,22 @@ def keys_command(
         except ValueError as error:
             raise FleetError(str(error)) from error
         make(folder, roster, days=days, hosts=hosts, overwrite=overwrite)
+    before = tuple[RosterEntry, ...]()
     if added:
+        before = read_roster(folder).participants
+        others = tuple(one for one in before if one not in added)
+        lifetimes(folder, Roster(read_roster(folder).fleet, others))  # refuses what could not be shown afterwards
         add_to(folder, added, days=days, hosts=hosts, overwrite=overwrite)
     roster = read_roster(folder)
     spans = lifetimes(folder, roster)
     if as_json:
         print_json(_plain(roster, {name: end for name, (_, end) in spans.items()}))
         return
-    out_console.print(_table(roster, spans))
+    out_console.print(_table(folder, roster, spans))
     if scenario or add:
         say(f"Keys of the fleet '{roster.fleet}' are in {folder}. Keep {folder / 'ca.key'} where no participant runs.")
+    if any(one not in before or one.role == "router" for one in added):
+        say(f"Copy {folder / ROSTER} to machines that have one and restart the routers: they read it when they start.")
     for one in roster.participants if scenario else added:
         if one.role == "router":
             valid = ", ".join(hosts_of(read(folder, one.file)))
@@ -94,15 +100,21 @@ def participant_of(text: str) -> RosterEntry:
         raise FleetError(str(error)) from error
 
 
-def _table(roster: Roster, spans: dict[str, tuple[datetime, datetime]]) -> Table:
-    from fleet.bus.security.certificates import CA, format_time
+def _table(folder: Path, roster: Roster, spans: dict[str, tuple[datetime, datetime]]) -> Table:
+    from fleet.bus.security.certificates import CA, format_time, key_fault
 
     now = datetime.now(UTC)
     rows = list[tuple[str, str, str]]()
-    held = [("(authority)", "", spans[CA]), *((one.name, one.role, spans[one.name]) for one in roster.participants)]
-    for name, role, (begin, end) in held:
+    held = [("(authority)", "", CA, spans[CA])]
+    held += [(one.name, one.role, one.file, spans.get(one.name)) for one in roster.participants]
+    for name, role, file, span in held:
+        if span is None:
+            rows.append((name, role, "not in this folder"))
+            continue
+        begin, end = span
         not_now = ", expired" if end < now else ", not yet valid" if begin > now else ""
-        rows.append((name, role, format_time(end) + not_now))
+        fault = key_fault(folder, file)
+        rows.append((name, role, format_time(end) + not_now + (f", {fault}" if fault else "")))
     return Table(head=("participant", "role", "certificate ends"), rows=tuple(rows), numbers=False)
 
 
@@ -110,7 +122,8 @@ def _plain(roster: Roster, ends: dict[str, datetime]) -> dict[str, object]:
     from fleet.bus.security.certificates import CA
 
     def row(one: RosterEntry) -> dict[str, object]:
-        who = {"name": one.name, "role": one.role, "common_name": one.common_name, "ends": ends[one.name].isoformat()}
+        end = ends[one.name].isoformat() if one.name in ends else None
+        who = {"name": one.name, "role": one.role, "common_name": one.common_name, "ends": end}
         return {**who, **asdict(rights(roster.fleet, one, by_consensus=roster.by_consensus))}
 
     return {

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 UNHEALTHY = 1
 """Exit code of `bus doctor`; 0 is a healthy fleet, and 2, as for every error of use, one that cannot be reached."""
+LINK_S = 3.0
+"""Real seconds between two checks of the links of a router."""
 _TLS = "Mutual TLS"
 _WEBHOOK = option(
     "URL that gets every change of an alarm; may be repeated. It is signed with THERMOFLEET_WEBHOOK_SECRET; beyond "
@@ -157,7 +159,9 @@ def router_command(
     router = Router(port, host=host, tls=own, state_hz=state_hz or None, connect=connect or ())
     with until_stopped() as stop, router:
         echo(router.endpoint)  # flushed: a supervisor reads this line
-        stop.wait()
+        while not stop.wait(LINK_S if connect else None):
+            for sentence in router.link_changes():
+                say(sentence)
         stop.leave("The router was interrupted; its clients keep trying to reconnect.")
 
 
@@ -224,7 +228,7 @@ def record_command(
     kept = sum(count.kept for count in recorder.counts.values())
     say(f"Recorded {kept} messages in {out}, {missed} missed.", out_console)
     if expiry := link.expiry:
-        raise BusError(f"Nothing has been recorded since the certificate expired. {expiry}")
+        raise BusError(f"Nothing has been recorded since the certificate expired. {expiry} Then start it again.")
     stop.leave("All that was received is on disk; the same command continues the recording.")
 
 
@@ -234,7 +238,10 @@ def replay_command(
     fleet: str | None = option("Name of the fleet. Default: that of the recording.", None),
     speed: float = option("Recorded seconds per real second.", 1.0, low=0, high=MAX_SPEED, above=True),
 ) -> None:
-    """Publish a run or a recording on the bus, in real time or at --speed; needs a router without TLS."""
+    """Publish a run or a recording on the bus, in real time or at --speed; needs a router without TLS.
+
+    It begins with the first state: messages of a time before it are published at once.
+    """
     from fleet.bus.client import BusClient
     from scenarios.live.recording import STATE_GAP_S, open_messages, replay
     from scenarios.signals import until_stopped
@@ -249,6 +256,8 @@ def replay_command(
         echo(f"ready replay {endpoint}")
         count = replay(messages, link, connect=connect, speed=speed, stopped=stop.is_set)
     say(f"Published {count.published} of {len(messages)} messages.", out_console)
+    if count.early:
+        say(f"{count.early} of them were of a time before the first state and were published at once.", out_console)
     if count.left_out:
         say(
             f"Left out {count.left_out} states that were due less than {1000 * STATE_GAP_S:.0f} ms after the one "
@@ -310,8 +319,10 @@ def ros2_command(
     given: Annotated[Given, From(options.Ros2Spec)],
 ) -> None:
     """Connect a fleet to ROS 2 over Zenoh (rmw_zenoh), until Ctrl-C or SIGTERM; needs the extra `ros2`."""
-    if (mode == "listen") != bool(topic):
-        raise FleetError(f"Only listen takes a TOPIC, and needs one (got {mode} {topic}".rstrip() + ").")
+    if mode == "listen" and not topic:
+        raise FleetError("listen needs the TOPIC of the arm's sensor_msgs/JointState, as /joint_states.")
+    if topic and mode != "listen":
+        raise FleetError(f"{mode} takes no TOPIC, as listen does: leave '{topic}' out.")
     from scenarios.live.ros2 import run_bridge, run_jobs, run_listener
 
     run = {"bridge": run_bridge, "listen": partial(run_listener, topic), "jobs": run_jobs}[mode]

@@ -318,6 +318,11 @@ def the_fleet(name: str, endpoint: str) -> str:
         return fleets[0]
     if fleets:
         raise FleetError(f"There are several fleets at {endpoint}: {', '.join(fleets)}. Choose one with --fleet.")
+    if endpoint.startswith("tls/"):
+        raise FleetError(
+            f"With TLS nobody may list the fleets at {endpoint}, and there is no roster.json beside the certificate: "
+            "name the fleet with --fleet."
+        )
     raise FleetError(f"There is no fleet at {endpoint} yet. Name the one to wait for with --fleet.")
 
 

@@ -102,6 +102,7 @@ def run_arm(
         Journal[ArmRecord](folder / f"{name}.journal", ArmRecord) as book,
         ExitStack() as resources,
     ):
+        link.require("show the token", keys.of_arm(fleet, name, "alive"))
         wait_for_name(link, name)
         source = None
         if alone:

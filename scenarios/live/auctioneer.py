@@ -11,6 +11,7 @@ import numpy as np
 
 from agents.policy import Policy
 from fleet.bus.client import BusClient
+from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobSpec, JobState, JobStatus, Submission
 from fleet.bus.router import other_versions
 from fleet.env.validation import actions_of
@@ -129,6 +130,7 @@ def run_auctioneer(scenario: Scenario, name: str, spec: LiveSpec, endpoint: str)
         BusClient(endpoint, fleet, stopped=stop.is_set) as link,
         Journal[BookRecord](folder / f"{name}.journal", BookRecord) as book,
     ):
+        link.require("show the token", keys.of_auction(fleet, name, "alive"))
         places = frozenset(place.name for place in scenario.places)
         timing = Timing(max_jobs=scenario.slots)
         node = AuctionNode(

@@ -16,6 +16,7 @@ from fleet.bus.security.tls import identified, why_not
 from fleet.errors import BusError, visible
 from fleet.live.monitor.health import MOST_REASONS, ClockProbe, HealthReport, check_health
 from fleet.live.monitor.snapshot import FleetListener, FleetSnapshot
+from scenarios.cli.options import the_fleet
 from scenarios.show.watch import arm_table, jobs_line, space_line
 from scenarios.show.words import clock
 from scenarios.terminal import echo, out_console, say
@@ -44,6 +45,8 @@ def diagnose(
         fleets = fleets_at(endpoint)
     except BusError as error:
         raise BusError(f"{error} {why_unreachable(endpoint)}".strip()) from error
+    if not fleet and not fleets and endpoint.startswith("tls/"):
+        the_fleet(fleet, endpoint)  # refuses: nobody may list them
     if not fleet and len(fleets) != 1:
         several = f"There are several fleets: {', '.join(fleets)}. Choose one with --fleet."
         none = "No fleet found: no arm or auctioneer has a liveliness token."

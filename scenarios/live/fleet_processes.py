@@ -12,6 +12,7 @@ from pathlib import Path
 import msgspec
 
 from agents.policy import no_simulator
+from fleet.bus.security.access_control import Role, file_of, read_roster
 from fleet.bus.security.tls import Tls
 from fleet.errors import FleetError, nearest
 from fleet.files import atomic_path
@@ -38,6 +39,8 @@ SHARED_BY_PAGE = ("scenarios.live.gateway",)
 PROGRAM = (sys.executable, "-c", "from scenarios.cli.main import main; main()")
 
 
+WATCHERS: tuple[Role, ...] = ("monitor", "operator", "submitter", "recorder")
+"""Roles that may watch a fleet with its jobs; the first with a certificate here is named."""
 CARD = "fleet.json"
 
 
@@ -172,24 +175,23 @@ def run_fleet(
     # The module of a policy of others may have begun what a fork cannot share: random numbers, threads, open files.
     forked = None if ":" in spec.policy else main
     with until_stopped() as stop, Supervisor(folder / "logs", program=PROGRAM, main=forked) as supervisor:
-        if not router:
-            supervisor.start(own_router, ready_s=START_S)
-        # The auctioneer starts last: its clock runs from its start, and the arms must be ready by then.
-        for together in (parts,) if router else ((record, *parts), () if auction is None else (auction,)):
+        # The auctioneer starts late: its clock runs from its start, and the arms must be ready by then.
+        own = () if router else ((own_router,), (record, *parts), () if auction is None else (auction,))
+        for together in (*(own or (parts,)), () if shown is None else (shown,)):
+            if stop.is_set():
+                break
             for part in together:
                 supervisor.start(part)
             for part in together:
                 supervisor.await_ready(part.name, START_S, stop.is_set)
-        if shown is not None:
-            supervisor.start(shown, ready_s=START_S)
-        watch = Tls(tls, "monitor").endpoint(at) if tls else at
-        say(
-            f"{fleet} is up: {count} at {at}, {spec.speed:g} times as fast as real time; logs in "
-            f"{supervisor.folder}. To watch it: thermofleet bus watch --scenario {scenario} --endpoint {watch}",
-            out_console,
-        )
-        if shown is not None:
-            say(f"Page: {shown.ready.removeprefix(PAGE_READY)}", out_console)
+        if not stop.is_set():
+            say(
+                f"{fleet} is up: {count} at {at}, {spec.speed:g} times as fast as real time; logs in "
+                f"{supervisor.folder}. {how_to_watch(scenario, at, tls)}",
+                out_console,
+            )
+            if shown is not None:
+                say(f"Page: {shown.ready.removeprefix(PAGE_READY)}", out_console)
         if ended := supervisor.run(stop.is_set):
             for line in supervisor.log_since_ready(ended).splitlines():
                 say(line, out_console)
@@ -201,6 +203,19 @@ def run_fleet(
     if not router:
         say(f"Recorded in {folder / 'recording'}.", out_console)
     stop.leave(f"The fleet was stopped; journals, recording and logs are in {folder}; the same command continues.")
+
+
+def how_to_watch(scenario: str, at: str, tls: Path | None) -> str:
+    """Sentence with the command that watches the fleet; with TLS by a certificate that is in the folder."""
+    command = f"thermofleet bus watch --scenario {scenario} --endpoint"
+    if tls is None:
+        return f"To watch it: {command} {at}"
+    roster = read_roster(tls)
+    for role in WATCHERS:
+        for name in roster.of_role(role):
+            if (tls / f"{file_of(name)}.key").is_file():
+                return f"To watch it: {command} {Tls(tls, name).endpoint(at)}"
+    return f"To watch it, copy monitor.pem and monitor.key to {tls}: {command} {Tls(tls, 'monitor').endpoint(at)}"
 
 
 def refuse_other_fleet(folder: Path, card: FleetCard, *, new_epoch: bool = False) -> None:
@@ -316,8 +331,6 @@ def check_roster(folder: Path | None, scenario: str) -> None:
     Raises:
         FleetError: it has not, or it is not a folder of keys of this scenario.
     """
-    from fleet.bus.security.access_control import read_roster
-
     if folder is None:
         raise FleetError("--scenario needs --tls: without TLS there are no certificates to check.")
     chosen, roster = load(scenario), read_roster(folder)

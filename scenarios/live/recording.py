@@ -356,6 +356,8 @@ class ReplayCount(NamedTuple):
     published: int
     left_out: int
     """States that came less than `STATE_GAP_S` after the one before."""
+    early: int = 0
+    """Published messages of a time before the first state; a recorder gets them from caches when it begins."""
 
 
 def replay(
@@ -366,9 +368,10 @@ def replay(
     speed: float,
     stopped: Callable[[], bool],
 ) -> ReplayCount:
-    """Publish messages at their own pace times `speed`, with the tokens of their arms.
+    """Publish messages at their own pace times `speed` from the first state on, with the tokens of their arms.
 
-    A router limits the states of each session, so every arm has its own, as a running arm.
+    Messages of a time before the first state are published at once. A router limits the states of each session, so
+    every arm has its own, as a running arm.
 
     Args:
         connect: Makes another client of the fleet, not open yet.
@@ -380,13 +383,14 @@ def replay(
     present = link.tokens(keys.of_every_arm(link.fleet, "alive"))
     if taken := sorted(present & set(arms)):
         raise FleetError(f"Arm '{taken[0]}' of fleet '{link.fleet}' is on the bus already. Give another --fleet.")
+    first_s = min(messages.telemetry["time_s"].to_pylist()) if arms else None
     with ExitStack() as resources:
         links = {arm: resources.enter_context(connect()) for arm in arms}
         for arm in arms:
             links[arm].declare_token(keys.of_arm(link.fleet, arm, "alive"))
         publishers: dict[str, Callable[[Message], None]] = {}
         last_due_s: dict[str, float] = {}  # of the states, by arm
-        start_s, first_s, published, left_out = time.monotonic(), None, 0, 0
+        start_s, published, left_out, early = time.monotonic(), 0, 0, 0
         for message in messages:
             first_s = message.time_s if first_s is None else first_s
             due_s = start_s + (message.time_s - first_s) / speed
@@ -411,4 +415,5 @@ def replay(
                 publishers[key] = links.get(sender, link).publisher(key, source.message)
             publishers[key](message)
             published += 1
-    return ReplayCount(published, left_out)
+            early += message.time_s < first_s
+    return ReplayCount(published, left_out, early)

@@ -58,6 +58,7 @@ PATIENCE_S = 30.0
 _NEEDS_ROLE = (
     "With TLS, use a certificate of the role operator that the router knows: it reads its roster when it starts."
 )
+STOPPED = "Stopped following; the auctioneer has the jobs."
 _UNKNOWN_KIND = re.compile(r"Invalid enum value '(.*)'", re.DOTALL)
 """Message of msgspec; of all fields of a job, only its kind is an enumeration."""
 Decoded = TypeVar("Decoded")
@@ -113,7 +114,9 @@ def submit_jobs(
                     f"No reply from an auctioneer of fleet '{link.fleet}' for {PATIENCE_S:.0f} s; its journal has the "
                     "accepted jobs."
                 )
-        stop.leave("Stopped following; the auctioneer has the jobs.")
+        stop.leave(STOPPED)
+        if stop.is_set():
+            say(STOPPED)
     ended = not wait or all(status and status.state == "finished" for status in client.statuses.values())
     return ended and all(admission.accepted for admission in admissions)
 

@@ -18,7 +18,7 @@ from fleet.bus.client import BusClient
 from fleet.bus.protocol.auction import SETTLED, ArmEvent, JobState, Result
 from fleet.bus.protocol.operator import Alarm
 from fleet.bus.router import fleets_at
-from fleet.errors import NoRouter, visible
+from fleet.errors import NoRouter, StoppedWaiting, visible
 from fleet.live.monitor.health import check_pauses
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetListener, FleetSnapshot, JobScore, describe_status
 from fleet.live.space import ANYWHERE
@@ -103,7 +103,8 @@ def wait_for_fleet(endpoint: str, stop: StopRequest) -> str:
     """Name of the only fleet at the router, once there is one.
 
     Raises:
-        FleetError: there are several, or stopped meanwhile.
+        FleetError: there are several.
+        StoppedWaiting: stopped meanwhile.
     """
     waits = False
     while True:
@@ -113,14 +114,13 @@ def wait_for_fleet(endpoint: str, stop: StopRequest) -> str:
             fleets = ()
         if len(fleets) == 1:
             return fleets[0]
-        if fleets:
+        if fleets or endpoint.startswith("tls/"):  # several, or none that a certificate may list
             return the_fleet("", endpoint)
         if not waits:
             say(f"Waiting for a fleet at {endpoint} …", err_console)
         waits = True
         if stop.wait(WAIT_S):
-            stop.leave("Stopped before there was a fleet.")
-            raise NoRouter(f"Stopped while waiting for a fleet at {endpoint}.")
+            raise StoppedWaiting(f"Stopped while waiting for a fleet at {endpoint}.")
 
 
 class ShiftEnd:

@@ -11,7 +11,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from fleet.bus.client import MOST_REJECTIONS, MOST_REPLIES, BusClient, Refused, _PendingQuery, under
+from fleet.bus.client import MOST_COUNTED, MOST_REJECTIONS, MOST_REPLIES, BusClient, Refused, _PendingQuery, under
 from fleet.bus.mailbox import Mailbox
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
@@ -281,6 +281,20 @@ def test_the_last_malformed_message_of_each_sender_is_kept(bus):
         listener.reject(f"flood {number}", "x" * MOST_BYTES)
     assert len(listener.rejections) == MOST_REJECTIONS
     assert max(map(len, listener.complaints().values())) < MOST_BYTES
+
+
+def test_a_new_fault_is_logged_after_many_of_another_and_a_flood_is_not(bus, caplog):
+    listener = bus()
+    for number in range(1000):
+        listener.reject("of /joint_states", f"A JointState has {number / 8:.3f} for position of joint_1.")
+    assert len(caplog.records) == 10  # 1, 2, 4, … 512
+    listener.reject("of /diagnostics", "The temperature_c of joint_1 is no number: 'warm'.")
+    listener.reject("of /joint_states", "A JointState names joint_2 twice.")
+    assert ["joint_1 is no number" in caplog.text, "names joint_2 twice" in caplog.text] == [True, True]
+    caplog.clear()
+    for number in range(100 * MOST_COUNTED):
+        listener.reject(f"token {number}", "not a key")
+    assert len(caplog.records) < MOST_COUNTED + 20
 
 
 def test_who_comes_and_goes_is_seen(bus):

@@ -252,6 +252,7 @@ def test_order_and_other_joints_do_not_matter(q, qd, tau, seed, more):
         (Joints(0.0, ("joint_1",), (1.0,)), "not joint_2"),
         (Joints(0.0, ("joint_1", "joint_2", "joint_1"), (1.0, 2.0, 1.0)), "joint_1 twice"),
         (Joints(0.0, ("joint_1", "joint_2"), (math.nan, math.nan)), "nan for position of joint_1"),
+        (Joints(0.0, ("joint_1", "joint_2"), (), (0.0, 0.0)), "no position of joint_1, joint_2"),
         (Joints(0.0, ("joint_2", "joint_1"), (1.0, 1.0), (math.nan, 0.0)), "nan for velocity of joint_2"),
         (Joints(0.0, ("joint_1", "joint_2"), (1.0, 1.0), (), (math.inf, 0.0)), "inf for effort of joint_1"),
     ],
@@ -282,7 +283,7 @@ def test_a_fault_is_an_error_of_the_arm_and_an_old_state_is_stale():
     assert told(mode="faulted")[0].level == ERROR
     assert {status.level for status in told(age_s=3.5, word=WORD)} == {STALE}
     assert {status.level for status in told(age_s=2.5, word=WORD)} == {OK}
-    assert temperatures(told(age_s=3.5), NAMES, "f/arm_0") == {}
+    assert temperatures(told(age_s=3.5), NAMES, "f/arm_0") == ({}, ())
 
 
 WORD = DifficultyScores("arm_0", 1, 12.0, "twin-1", ("j", "k", "l"), (0.5, None, 0.25), (0.1, None, None))
@@ -302,15 +303,30 @@ def test_the_difficulty_of_every_open_job_is_published():
 @given(st.tuples(*[st.floats(-50, 200)] * 7))
 def test_temperatures_survive_a_round_trip(temp_c):
     statuses = read_diagnostics(write_diagnostics(1.0, told(temp_c=temp_c)))
-    assert temperatures(statuses, NAMES, "f/arm_0") == dict(zip(NAMES, temp_c, strict=True))
-    assert temperatures(statuses, NAMES, "f/arm_1") == {}
+    assert temperatures(statuses, NAMES, "f/arm_0") == (dict(zip(NAMES, temp_c, strict=True)), ())
+    assert temperatures(statuses, NAMES, "f/arm_1") == ({}, ())
 
 
-@pytest.mark.parametrize("said", ["warm", "nan", "inf", ""])
-def test_a_temperature_that_is_no_number_is_refused(said):
-    status = Diagnostic(OK, "n", "", "joint_1", (("temperature_c", said),))
-    with pytest.raises(MalformedMessage, match="temperature_c of joint_1"):
-        temperatures([status], NAMES, "")
+@pytest.mark.parametrize("said", ["warm", "nan", "inf", "", "41.5 C", "4_1.5", "٤١", "1e999"])
+def test_a_temperature_that_is_no_number_is_left_out_and_named(said):
+    values = {"joint_1": "40.25", "joint_2": said, "joint_3": " 4.1e1 "}
+    statuses = [Diagnostic(OK, "n", "", name, (("temperature_c", text),)) for name, text in values.items()]
+    temp_c, faults = temperatures(statuses, NAMES, "")
+    assert temp_c == {"joint_1": 40.25, "joint_3": 41.0}
+    assert faults == (f"The temperature_c of joint_2 is no number: '{said}'.",)
+
+
+def test_two_temperatures_of_a_joint_are_left_out_and_named():
+    once, again = (("temperature_c", "40.0"),), (("temperature_c", "41.0"),)
+    statuses = [
+        Diagnostic(OK, "n", "", "joint_1", once),
+        Diagnostic(OK, "n", "", "joint_1", (*once, ("temperature_c", "41.0"))),
+        Diagnostic(STALE, "n", "", "joint_2", once),
+        Diagnostic(OK, "n", "", "joint_2", again),
+        Diagnostic(OK, "n", "", "joint_2", (("voltage", "24"),)),
+    ]
+    faults = ("A DiagnosticArray has 3 values of temperature_c of joint_1.",)
+    assert temperatures(statuses, NAMES, "") == ({"joint_2": 41.0}, faults)
 
 
 STRING = "std_msgs/msg/String"

@@ -1,6 +1,7 @@
 """The router: a free port of this machine; and what holds behind one holds across two linked ones."""
 
 import queue
+import re
 import socket
 import time
 from contextlib import ExitStack
@@ -290,6 +291,45 @@ def test_a_link_needs_tls(place):
         Router(connect=["tcp/127.0.0.1:7447"])
     with pytest.raises(BusError, match=r"no endpoint for the certificate of 'router'. Expected tls/"):
         Router(tls=Tls(place, "router"), connect=["tcp/127.0.0.1:7447"])
+
+
+def test_a_link_is_reported_when_it_opens_and_when_it_is_lost(place):
+    with Router(tls=Tls(place, "router")) as near:
+        endpoint = near.endpoint.replace("127.0.0.1", "localhost")
+        far = Router(tls=Tls(place, FAR.name), connect=[endpoint]).open()
+        wait_until(lambda: near.linked() == far.linked() == 1)
+        with Router(tls=Tls(place, "router"), connect=[far.endpoint]) as beside:  # the certificate of `near`
+            assert far.link_changes() == [f"Linked to the router at {endpoint}."]
+            wait_until(lambda: beside.linked() == 1)
+            assert beside.link_changes() == [f"Linked to the router at {far.endpoint}."]
+        assert far.link_changes() == []
+    wait_until(lambda: far.linked() == 0)
+    assert far.link_changes() == [
+        f"No link to the router at {endpoint} (Connection refused). It is tried again every second."
+    ]
+    assert far.link_changes() == []
+    far.close()
+
+
+def test_a_missing_link_has_its_reason(place, tmp_path):
+    make(tmp_path / "other", of_arms("f", ARMS), days=30)
+    with Router() as plain, Router(tls=Tls(tmp_path / "other", "router")) as foreign, ExitStack() as stack:
+        unknown, http = "tls/nowhere.invalid:7447", plain.endpoint.replace("tcp/", "tls/")
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            port = free.getsockname()[1]
+        own = f"tls/127.0.0.1:{port}"
+        connect = [unknown, http, foreign.endpoint, own]
+        router = stack.enter_context(Router(port, tls=Tls(place, "router"), connect=connect))
+        reasons = [
+            "not known|resolution",
+            "does not use TLS",
+            "is not valid: .*another fleet",
+            "address of this router",
+        ]
+        sentences = router.link_changes()
+        assert len(sentences) == len(reasons)
+        for endpoint, reason, sentence in zip(connect, reasons, sentences, strict=True):
+            assert re.search(rf"No link to the router at {re.escape(endpoint)} \(.*({reason})", sentence), sentence
 
 
 @pytest.mark.ci_slow

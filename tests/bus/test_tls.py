@@ -16,7 +16,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.router import Router, fleets_at, open_client
 from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import issue, make
-from fleet.bus.security.tls import Tls
+from fleet.bus.security.tls import Tls, why_not
 from fleet.errors import BusError
 from tests.waiting import PATIENCE_S, wait_until
 
@@ -74,12 +74,16 @@ def test_nobody_gets_in_without_a_certificate(open_stranger, guarded, folder):
     [
         ("nodir/monitor", r"There is no '.*nodir/monitor\.pem'; thermofleet bus keys makes it\."),
         ("f/nobody", r"There is no '.*f/nobody\.pem'; thermofleet bus keys makes it\."),
+        ("f/monitor.pem", r"There is no '.*f/monitor\.pem\.pem'; leave the ending out: '.*f/monitor'\."),
+        ("f/arm_0.key", r"leave the ending out: '.*f/arm_0'\."),
+        ("elsewhere/nobody", r"nobody\.pem'; copy it from the machine that has ca\.key, where thermofleet bus keys ma"),
         ("f", r"There is no '.*/f\.pem'; name a participant of the folder, as '.*/f/monitor'\."),
         ("f/", r"There is no '.*/f\.pem'; name a participant of the folder, as '.*/f/monitor'\."),
         ("f/..", r"names no participant\. Expected tls/127\.0\.0\.1:\d+#FOLDER/NAME\."),
     ],
 )
 def test_a_wrong_path_of_a_certificate_is_named_by_whoever_uses_the_endpoint(guarded, folder, participant, reason):
+    (folder.parent / "elsewhere").mkdir(exist_ok=True)
     endpoint = f"{guarded.endpoint}#{folder.parent}/{participant}"
     for use in (fleets_at, lambda endpoint: BusClient(endpoint, "f").open()):
         with pytest.raises(BusError, match=reason):
@@ -95,6 +99,13 @@ def test_plain_tcp_and_tls_do_not_meet(guarded, open_router, folder):
         open_client(secure, timeout_s=SHORT_S, tls=Tls(folder, "arm_0"))
     with pytest.raises(BusError, match="Expected tls/"):
         open_client(open_router.endpoint, timeout_s=SHORT_S, tls=Tls(folder, "arm_0"))
+
+
+def test_a_router_that_accepts_connections_and_is_suspended_is_not_taken_for_one_without_tls(folder):
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        reason, stays = why_not("127.0.0.1", silent.getsockname()[1], Tls(folder, "arm_0"))
+    assert reason.startswith("no reply to the TLS handshake: the server is suspended")
+    assert not stays
 
 
 def test_keys_of_another_fleet_open_no_line_and_the_reason_is_told(guarded, tmp_path):
@@ -152,7 +163,7 @@ def test_a_line_ends_with_its_certificate(folder, guarded, tmp_path):
         watch.undeclare()
 
 
-def test_a_client_reports_that_its_certificate_has_expired(folder, guarded, tmp_path, caplog):
+def test_a_client_reports_that_its_certificate_has_expired_and_was_renewed(folder, guarded, tmp_path, caplog):
     place = rogue_folder(tmp_path / "k", folder, "good")
     soon = datetime.now(UTC) + timedelta(seconds=2.0)
     issue(place, RosterEntry("arm_0", "arm"), days=1, now=soon - timedelta(days=1))
@@ -162,7 +173,11 @@ def test_a_client_reports_that_its_certificate_has_expired(folder, guarded, tmp_
         arm.serve()
         arm.serve()
         assert arm.expiry.startswith(f"The certificate of 'arm_0' expired on {soon:%Y-%m-%d %H:%M} UTC")
-    assert [each.levelname for each in caplog.records if each.getMessage() == arm.expiry] == ["ERROR"]
+        assert [each.levelname for each in caplog.records if each.getMessage() == arm.expiry] == ["ERROR"]
+        issue(place, RosterEntry("arm_0", "arm"), days=30)
+        again = "The certificate of 'arm_0' was renewed, and it is connected again."
+        wait_until(lambda: again in caplog.text, arm.serve)
+        assert (arm.connected, arm.expiry) == (True, "")
 
 
 def test_a_key_that_others_may_read_is_not_used(folder, tmp_path, guarded):

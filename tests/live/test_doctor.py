@@ -117,14 +117,15 @@ def test_jobs_do_not_wait_in_vain_while_an_arm_moves_without_one(change, in_vain
         assert waits == in_vain
 
 
-def test_space_of_an_arm_that_has_gone_is_a_fault_if_jobs_wait_for_it():
-    jobs = (JobStatus("j", "waiting", reason=WAY),)
+@pytest.mark.parametrize("reason", [WAY, "It waits until a, gone one are out of the way. gone one is not present."])
+def test_space_of_an_arm_that_has_gone_is_a_fault_if_jobs_wait_for_it(reason):
+    jobs = (JobStatus("j", "waiting", reason=reason),)
     gone = arm(arm="gone one", token=False, present=False, state_age_s=5.2)
     now = msgspec.structs.replace(fleet(arm(), gone, counts={"waiting": 1}), jobs=jobs, space={"gone one": ("s",)})
     output, _ = faults(now, earlier=now)
     assert any("not present for 5 s; 1 job(s) wait for it" in each for each in output)
     assert any(each.endswith("thermofleet arm clear 'gone one'") for each in output)
-    assert sum(WAY in each for each in output) == 1
+    assert sum(reason in each for each in output) == 1
 
 
 @pytest.mark.parametrize(

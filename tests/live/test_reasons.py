@@ -58,6 +58,10 @@ def bidding(*quotes: Quote, **more: Any) -> Bidding:
             "It waits until b is out of the way. b has a job.",
         ),
         (
+            bidding(quote("a"), taken={"b": frozenset(["near"]), "c": frozenset(["near"])}),
+            "It waits until b, c are out of the way.",
+        ),
+        (
             bidding(
                 quote("a", capacity=0, mode="faulted"), quote("b", capacity=0, headroom_k=-0.5),
                 quote("c", capacity=0), quote("d", plans=(), reason="too far"),

@@ -313,13 +313,29 @@ def test_a_replay_publishes_the_same_messages_and_refuses_names_of_present_arms(
         begin = partial(link.publish, keys.of_auction("f", "boss", "operation"), operation(0))
         wait_until(lambda: rows(tmp_path / "second", "operations"), begin)
         connect = partial(BusClient, router.endpoint, "f")
-        assert replay(messages, link, connect=connect, speed=40.0, stopped=lambda: False) == (60, 0)
+        assert replay(messages, link, connect=connect, speed=40.0, stopped=lambda: False) == (60, 0, 0)
         serve_until(lambda: rows(tmp_path / "second", "results") == 20, link)
         link.declare_token(keys.of_arm("f", "a", "alive"))
         with connect() as other, pytest.raises(FleetError, match="on the bus already"):
             replay(messages, other, connect=connect, speed=40.0, stopped=lambda: False)
     for kind in ("telemetry", "events", "results"):
         assert read_parts(tmp_path / "second", kind).equals(read_parts(tmp_path / "first", kind)), kind
+
+
+def test_a_replay_begins_with_the_first_state(tmp_path):
+    """A recorder of a running fleet gets events and results of long ago from caches."""
+    recorder = Recorder.open(tmp_path, "f")
+    for number in range(3):
+        recorder.add("boss", result(number))
+    for tick in range(1200, 1205):
+        recorder.add("a", state("a", tick))
+    recorder.write()
+    link = MagicMock(fleet="f")
+    link.tokens.return_value = set()
+    began_s = time.monotonic()
+    count = replay(open_messages(tmp_path), link, connect=lambda: link, speed=10.0, stopped=lambda: False)
+    assert count == (8, 0, 3)
+    assert 0.4 <= time.monotonic() - began_s < 60.0
 
 
 def test_a_replay_publishes_a_request_under_the_key_of_its_arm_or_auctioneer(tmp_path):
@@ -332,7 +348,7 @@ def test_a_replay_publishes_a_request_under_the_key_of_its_arm_or_auctioneer(tmp
     link.tokens.return_value = set()
     arm.__enter__.return_value = arm
     messages = open_messages(tmp_path)
-    assert replay(messages, link, connect=lambda: arm, speed=100.0, stopped=lambda: False) == (3, 0)
+    assert replay(messages, link, connect=lambda: arm, speed=100.0, stopped=lambda: False) == (3, 0, 1)
     link.publisher.assert_called_once_with(keys.of_auction("f", "boss", "operation"), Operation)
     arm.publisher.assert_any_call(keys.of_arm("f", "a", "operation"), Operation)
 
@@ -349,11 +365,11 @@ def test_a_replay_shows_every_arm_to_a_subscriber_without_history_and_counts_sta
         connect = partial(BusClient, router.endpoint, "f")
         with connect() as link, connect() as other:
             other.subscribe(keys.of_every_arm("f", "state"), State, lambda name, _: seen.append(name))
-            assert replay(messages, link, connect=connect, speed=40.0, stopped=lambda: False) == (80, 0)
+            assert replay(messages, link, connect=connect, speed=40.0, stopped=lambda: False) == (80, 0, 0)
             serve_until(lambda: all(seen.count(arm) >= 10 for arm in arms), other)
     stub = MagicMock(fleet="f")
     stub.tokens.return_value = set()
-    assert replay(messages, stub, connect=lambda: stub, speed=80.0, stopped=lambda: False) == (40, 40)
+    assert replay(messages, stub, connect=lambda: stub, speed=80.0, stopped=lambda: False) == (40, 40, 0)
 
 
 def test_two_recorders_cannot_share_a_folder(tmp_path):

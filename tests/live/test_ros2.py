@@ -336,6 +336,18 @@ def test_a_real_arm_is_an_arm_of_the_fleet(place, hashes):
     assert ticks == sorted(set(ticks))
 
 
+def test_states_that_a_pause_of_the_driver_withholds_are_not_lost_ones(place, monkeypatch):
+    """A recorder counts gaps in the ticks as missed messages."""
+    monkeypatch.setattr(ros2_bridge, "FRESH_S", 0.1)
+    place.until(lambda: place.states)
+    paused_s = time.monotonic()
+    place.until(lambda: time.monotonic() > paused_s + 0.5, lambda: None)
+    published = len(place.states)
+    place.until(lambda: len(place.states) > published)
+    ticks = [state.tick for state in place.states]
+    assert ticks == list(range(ticks[0], ticks[0] + len(ticks)))
+
+
 class Seen:
     """A monitor that keeps its readings."""
 
@@ -378,6 +390,16 @@ def test_malformed_messages_are_counted_and_change_nothing(place, rubbish):
     place.until(lambda: place.states and place.link.malformed >= 2, lambda: (place.live(), rubbish(place)))
     assert {state.q for state in place.states} == {Q}
     assert {state.temp_c for state in place.states} == {TEMP_C}
+
+
+def test_one_unusable_temperature_leaves_the_others(place, caplog):
+    def send():
+        place.play(joint_state())
+        place.warm(diagnostics(temp_c=(*TEMP_C[:6], "41.5 C")))
+
+    readings = place.follower._readings
+    place.until(lambda: readings.missing(time.monotonic()) == "no temperature of joint_7", send)
+    assert "temperature_c of gen3/joint_7 is no number: '41.5 C'" in caplog.text
 
 
 def test_a_real_arm_takes_no_work_and_gives_the_reason(place):

@@ -134,6 +134,17 @@ def test_a_system_that_cannot_start_a_process_does_not_end_supervision(tmp_path,
         supervisor.run(until(lambda: supervisor.ready("a")), poll_s=0.02)
 
 
+def test_a_process_that_is_cut_off_is_reported_once(tmp_path, caplog):
+    waiting = "fleet.bus.router: Waiting for a router. No router answered at tcp/127.0.0.1:1."
+    expired = "fleet.bus.client: The certificate of 'arm_0' expired on 2026-11-30 07:28 UTC."
+    lines = f"WARNING  {waiting}\nERROR    {expired}\nWARNING  fleet.bus.client: Dropped 1 message(s)."
+    with Supervisor(tmp_path) as supervisor:
+        for name in ("arm-a", "arm-b"):
+            supervisor.start(part(name, f"print({lines!r}); {WAIT}"), ready_s=PATIENCE_S)
+    messages = [record.getMessage() for record in caplog.records]
+    assert messages == [f"'arm-a': {line.partition(': ')[2]}" for line in (waiting, expired)]
+
+
 def test_the_fleet_ends_when_an_essential_process_exits_with_code_0(tmp_path):
     with Supervisor(tmp_path) as supervisor:
         supervisor.start(part("stays", WAIT), ready_s=PATIENCE_S)

@@ -2,6 +2,8 @@
 
 import http.client
 import json
+import shutil
+import signal
 import time
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -191,6 +193,25 @@ def test_an_error_of_tls_is_one_sentence(fleet):
     assert isinstance(done.exception, BusError)
     with pytest.raises(BusError, match=r"^There is no '\S+/nobody\.pem'; thermofleet bus keys makes it\.$"):
         raise done.exception
+
+
+@pytest.mark.parametrize("command", ["bus watch", "bus watch --json", "bus doctor", "job list"])
+def test_without_a_roster_the_fleet_has_to_be_named(fleet, tmp_path, command):
+    for file in ("ca.pem", "monitor.pem", "monitor.key"):
+        shutil.copy(fleet.keys / file, tmp_path)
+    done = CliRunner().invoke(app, [*command.split(), "--endpoint", f"{fleet.address}#{tmp_path}/monitor"])
+    assert isinstance(done.exception, FleetError)
+    with pytest.raises(FleetError, match=r"^With TLS nobody may list the fleets .* name the fleet with --fleet\.$"):
+        raise done.exception
+
+
+def test_a_router_reports_its_links(fleet):
+    own = ("bus", "router", "--port", 0, "--tls", fleet.keys, "--connect")
+    with commands.ready(*own, fleet.address, "--connect", "tls/127.0.0.1:1") as (process, _):
+        assert process.stderr is not None
+        assert process.stderr.readline() == f"Linked to the router at {fleet.address}.\n"
+        assert "tls/127.0.0.1:1 (Connection refused)" in process.stderr.readline()
+        assert commands.end(process, signal.SIGTERM) == (0, "")
 
 
 def test_a_recorder_whose_certificate_expires_ends_with_an_error(fleet, tmp_path, monkeypatch):

@@ -27,7 +27,7 @@ from fleet.errors import FleetError
 from fleet.live.arm.awards import ArmRecord, Closed
 from fleet.live.journal import Journal
 from scenarios.cli.main import main
-from scenarios.live.fleet_processes import chosen_arms, free_port, parts_of
+from scenarios.live.fleet_processes import chosen_arms, free_port, how_to_watch, parts_of
 from scenarios.live.gateway import ROLES, check, check_token, permitted_role, read_tokens, run_gateway
 from scenarios.spec.options import LiveSpec
 from tests import commands
@@ -59,6 +59,16 @@ def test_a_router_prints_its_endpoint_and_exits_on_a_signal(number, code):
         assert out == ""
         assert ("The router was interrupted" in err) == (code == 130)
         assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+@pytest.mark.parametrize("words", ["record f --out r", "watch", "ros2 bridge --fleet f", "gateway --fleet f --port 0"])
+def test_a_process_that_waits_for_a_router_exits_on_a_signal(tmp_path, words, number, code):
+    with commands.start("bus", *words.split(), "--endpoint", "tcp/127.0.0.1:1", cwd=tmp_path) as process:
+        assert "Waiting for a " in process.stderr.readline()
+        returned, errors = commands.end(process, number)
+    assert returned == code
+    assert re.fullmatch(r"Stopped while waiting for a .* at tcp/127\.0\.0\.1:1\.\n" if code else "", errors)
 
 
 def test_a_router_with_tls_enforces_access_and_the_state_rate(folder):
@@ -138,6 +148,8 @@ SEVERAL_MACHINES = {
     "--host 0.0.0.0": "needs --tls",
 }
 ROS2 = {
+    "listen": "listen needs the TOPIC of the arm's sensor_msgs/JointState",
+    "bridge /joint_states": "bridge takes no TOPIC, as listen does: leave '/joint_states' out",
     "listen /joint_states": "has no motor temperatures",
     "listen /j --temperatures /d --joints a,a": "different names",
     "jobs": "needs the Python module 'rclpy' of ROS 2",
@@ -192,6 +204,58 @@ def test_keys_are_made_shown_and_extended(thermofleet, folder):
     assert "(authority)" in out
 
 
+def test_a_certificate_is_checked_before_the_name_is_sought_on_the_bus(thermofleet, small_toml, tmp_path):
+    """Both names are present, which is no reason to stop them if the certificate is of another participant."""
+    place = tmp_path / "keys"
+    assert thermofleet("bus", "keys", place, small_toml)[0] == 0
+    with Router(tls=Tls(place, "router")) as router, ExitStack() as stack:
+        at = {name: f"{router.endpoint}#{place}/{name}" for name in ("left", "right", "auctioneer", "submitter")}
+        tokens = {"left": keys.of_arm("heat", "left", "alive")}
+        tokens["auctioneer"] = keys.of_auction("heat", "auctioneer", "alive")
+        for name, token in tokens.items():
+            stack.enter_context(BusClient(at[name], "heat")).declare_token(token)
+        arm = ("arm", "run", small_toml, "left", "--difficulty", "blind", "--journal", tmp_path / "run")
+        needed = "a certificate of the role arm and the name 'left'"
+        assert thermofleet(*arm, "--endpoint", at["right"]).refused(needed)
+        auction = ("bus", "auctioneer", small_toml, "--journal", tmp_path / "run", "--endpoint", at["submitter"])
+        assert thermofleet(*auction).refused("a certificate of the role auctioneer and the name 'auctioneer'")
+
+
+def test_a_folder_with_some_of_the_keys_is_shown_and_extended(thermofleet, folder):
+    for name in ("router.pem", "router.key"):
+        (folder / name).unlink()
+    before = (folder / "arm_0.pem").read_bytes()
+    code, out, err = thermofleet("bus", "keys", folder, "--add", "arm_0:arm", "--overwrite")
+    assert code == 0
+    assert "restart the routers" not in err  # the roster is the same
+    assert "restart the routers" in " ".join(thermofleet("bus", "keys", folder, "--add", "arm_9:arm")[2].split())
+    assert (folder / "arm_0.pem").read_bytes() != before
+    rows = dict(line.split(maxsplit=1) for line in out.splitlines()[2:])
+    assert rows["router"].split(maxsplit=1)[1].rstrip() == "not in this folder"
+    told = json.loads(thermofleet("bus", "keys", folder, "--json")[1])
+    assert [one["name"] for one in told["participants"] if one["ends"] is None] == ["router"]
+
+
+def test_a_damaged_certificate_is_refused_before_another_is_replaced(thermofleet, folder):
+    (folder / "router.pem").write_text("")
+    before = (folder / "arm_0.pem").read_bytes()
+    words = ("bus", "keys", folder, "--overwrite", "--add")
+    assert thermofleet(*words, "arm_0:arm").refused("router.pem' is not a certificate")
+    assert (folder / "arm_0.pem").read_bytes() == before
+    assert thermofleet(*words, "arm_0:arm", "--add", "router:router")[0] == 0
+
+
+def test_a_key_that_cannot_be_used_is_listed(thermofleet, folder):
+    (folder / "arm_0.key").chmod(0o640)
+    (folder / "ca.key").chmod(0o604)
+    (folder / "arm_1.key").unlink()
+    (folder / "arm_1.key").mkdir()
+    rows = dict(line.split(maxsplit=1) for line in thermofleet("bus", "keys", folder)[1].splitlines()[1:])
+    endings = {"arm_0": ", key readable by others", "arm_1": ", key is no file", "arm_2": "UTC"}
+    for name, ending in (endings | {"(authority)": endings["arm_0"]}).items():
+        assert rows[name].rstrip().endswith(ending), name
+
+
 def test_the_hosts_of_a_new_certificate_of_a_router_are_named(thermofleet, folder):
     renew = ("bus", "keys", folder, "--add", "router:router", "--overwrite")
     for hosts, named in ((["cell-1", "10.0.0.7"], ", cell-1, 10.0.0.7"), ([], "")):
@@ -220,6 +284,31 @@ def test_up_gives_every_process_its_own_certificate_and_the_router_here_or_elsew
     assert router.argv[router.argv.index("--host") + 1] == "0.0.0.0"
     assert router.ready == "tls/127.0.0.1:7447"
     assert parts_of("quickstart", names, spec, host="fd00::1", **options)[0].ready == "tls/[fd00::1]:7447"
+
+
+def test_a_part_of_a_fleet_that_waits_for_its_router_says_so_and_is_not_up(small_toml, tmp_path):
+    elsewhere = ("--arms", "left", "--router", "tcp/127.0.0.1:1", "--difficulty", "blind")
+    with commands.start("up", small_toml, *elsewhere, "--out", tmp_path / "out") as process:
+        assert process.stderr is not None
+        while "'arm-left': Waiting for a router. No router answered" not in process.stderr.readline():
+            assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, out) == (130, "")
+    assert err.startswith("Stopping all processes in order")
+
+
+def test_the_command_to_watch_names_a_certificate_that_is_there(folder):
+    at = "tls/cell-1:7447"
+    command = f"thermofleet bus watch --scenario quickstart --endpoint {at}#{folder}/"
+    assert how_to_watch("quickstart", at, folder) == f"To watch it: {command}monitor"
+    (folder / "monitor.key").unlink()
+    assert how_to_watch("quickstart", at, folder) == f"To watch it: {command}operator"
+    for name in ("operator", "submitter", "gateway", "recorder"):
+        (folder / f"{name}.key").unlink(missing_ok=True)
+    sentence = f"To watch it, copy monitor.pem and monitor.key to {folder}: {command}monitor"
+    assert how_to_watch("quickstart", at, folder) == sentence
+    assert how_to_watch("quickstart", PLAIN, None).endswith(f"--endpoint {PLAIN}")
 
 
 def reports(folder):

@@ -506,6 +506,21 @@ def test_jobs_can_be_followed_to_their_end(endpoint, tmp_path, thermofleet, end,
     assert said[:2] == (code, f"a: accepted\na: waiting\na: awarded to arm_0\na: {end} {link} arm_0\n")
 
 
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 1), (signal.SIGINT, 130)])
+def test_following_jobs_ends_with_a_sentence_on_a_signal(endpoint, number, code):
+    def declare(bus: BusClient) -> None:
+        taken = SubmissionReply("auctioneer", (Admission("hold", True),))
+        waiting = Status("auctioneer", 0.0, (JobStatus("hold", "waiting"),))
+        bus.reply_to(keys.of_jobs("f", "submit"), Submission, lambda _: taken)
+        bus.reply_to(keys.of_jobs("f", "status"), StatusRequest, lambda _: waiting)
+
+    words = ("job", "submit", "--kind", "hold", "--place", "bench", "--wait", "--endpoint", endpoint, "--fleet", "f")
+    with served(endpoint, declare), commands.ready(*words) as (process, _):
+        assert process.stdout is not None
+        assert process.stdout.readline() == "hold: waiting\n"
+        assert commands.end(process, number) == (code, "Stopped following; the auctioneer has the jobs.\n")
+
+
 def test_a_list_of_jobs_has_a_line_for_each_and_ages_since_their_acceptance(endpoint, thermofleet, monkeypatch):
     """At 3600 s; `new` was accepted at 3480 s, `planned` at 60 s for 3000 s."""
     why = "It waits until the_arm_beside_the_belt is out of the way."

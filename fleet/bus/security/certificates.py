@@ -213,11 +213,20 @@ def _bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except FileNotFoundError as error:
-        folder = path.with_suffix("")
-        hint = f"name a participant of the folder, as '{folder / 'monitor'}'" if folder.is_dir() else ""
-        raise BusError(f"There is no '{path}'; {hint or 'thermofleet bus keys makes it'}.") from error
+        raise BusError(f"There is no '{path}'; {_how_to_get(path)}.") from error
     except OSError as error:
         raise BusError(f"Cannot read '{path}': {error.strerror}.") from error
+
+
+def _how_to_get(path: Path) -> str:
+    named = path.with_suffix("")
+    if named.is_dir():
+        return f"name a participant of the folder, as '{named / 'monitor'}'"
+    if named.suffix in (".pem", ".key"):
+        return f"leave the ending out: '{named.with_suffix('')}'"
+    if path.parent.is_dir() and path.name != f"{CA}.key" and not (path.parent / f"{CA}.key").exists():
+        return f"copy it from the machine that has {CA}.key, where thermofleet bus keys makes it"
+    return "thermofleet bus keys makes it"
 
 
 def _read_key(folder: Path, file: str) -> ec.EllipticCurvePrivateKey:
@@ -338,14 +347,32 @@ def add(
 
 
 def lifetimes(folder: Path, roster: Roster) -> dict[str, tuple[datetime, datetime]]:
-    """When each certificate of a folder begins and expires, by name, the authority's included.
+    """When each certificate in a folder begins and expires, by name, the authority's included.
+
+    Participants whose certificate is on another machine are left out.
 
     Raises:
-        BusError: one is missing or damaged.
+        BusError: one is damaged, or that of the authority is missing.
     """
-    files = {CA: CA, **{one.name: one.file for one in roster.participants}}
+    files = {one.name: one.file for one in roster.participants if (folder / f"{one.file}.pem").exists()}
+    files[CA] = CA
     certificates = {name: read(folder, file) for name, file in files.items()}
     return {name: (one.not_valid_before_utc, one.not_valid_after_utc) for name, one in certificates.items()}
+
+
+def key_fault(folder: Path, file: str) -> str:
+    """Why the private key `FILE.key` of a folder cannot be used; "" for none, and without such a file."""
+    key = folder / f"{file}.key"
+    if not key.exists():
+        return ""
+    if not key.is_file():
+        return "key is no file"
+    return "key readable by others" if readable_by_others(key) else ""
+
+
+def readable_by_others(key: Path) -> bool:
+    """Whether other users of this machine may read a private key."""
+    return os.name == "posix" and key.stat().st_mode & 0o077 != 0
 
 
 def _write_roster(folder: Path, roster: Roster) -> None:

@@ -47,7 +47,7 @@ class Tls:
             BusError: a file is missing, damaged, expired or of another authority, or the key is readable by others.
         """
         # Imported late: plain TCP does not need the library.
-        from fleet.bus.security.certificates import check, common_name, format_time
+        from fleet.bus.security.certificates import check, common_name, format_time, readable_by_others
 
         certificate = check(self.folder, self.file)
         owner = common_name(certificate)
@@ -55,7 +55,7 @@ class Tls:
             needs = "a router needs that of a router" if serves else "only the router may use it"
             raise BusError(f"'{self.folder / self.file}.pem' is the certificate of '{owner}'; {needs}.")
         key = self._path(f"{self.file}.key")
-        if os.name == "posix" and key.stat().st_mode & 0o077:
+        if readable_by_others(key):
             raise BusError(f"Others on this machine may read the private key '{key}': chmod 600 it.")
         expires = certificate.not_valid_after_utc
         if expires - datetime.now(UTC) < REMIND:
@@ -181,7 +181,7 @@ def is_past(moment: datetime) -> bool:
     return datetime.now(UTC) >= moment
 
 
-_NO_REPLY = "the server does not use TLS: no reply to the handshake"
+_NO_REPLY = "no reply to the TLS handshake: the server is suspended or overloaded, or does not use TLS"
 
 
 def why_not(host: str, port: int, tls: Tls | None) -> tuple[str, bool]:
@@ -195,6 +195,20 @@ def why_not(host: str, port: int, tls: Tls | None) -> tuple[str, bool]:
     except OSError as error:
         return error.strerror or str(error), False
     return reason, reason not in ("", _NO_REPLY)
+
+
+def server_name(host: str, port: int, tls: Tls) -> str:
+    """Common name in the certificate of a server, as `router:router_2`; "" if a handshake with it fails."""
+    with (
+        suppress(OSError),
+        socket.create_connection((host, port), timeout=_PROBE_S) as line,
+        tls.context().wrap_socket(line, server_hostname=host) as secure,
+    ):
+        subject = (secure.getpeercert() or {}).get("subject", ())
+        for ((field, value),) in cast(tuple[tuple[tuple[str, str]], ...], subject):
+            if field == "commonName":
+                return value
+    return ""
 
 
 def _why_not_plain(line: socket.socket) -> str:

@@ -271,7 +271,8 @@ def reason_to_wait(bidding: Bidding, job: str) -> str:
         return _no_arm(refusals, others, "other arm" if out else "arm")
     plans = [(arm, plan) for arm in able.keys() & bidding.quotes for plan in able[arm]]
     in_way = {other for arm, plan in plans for other in bidding.in_the_way(arm, plan.space)}
-    reasons = [f"It waits until {', '.join(sorted(in_way))} is out of the way."] if in_way else []
+    are = "are" if len(in_way) > 1 else "is"
+    reasons = [f"It waits until {', '.join(sorted(in_way))} {are} out of the way."] if in_way else []
     reasons += [f"{_not_present(in_way & bidding.absent)}."] if in_way & bidding.absent else []
     taken = [f"{arm} {_why_without_capacity(bidding, arm)}" for arm in able if arm in bidding.full]
     reasons += [f"{', '.join([*taken, *others])}."] if taken or others else []

@@ -1,5 +1,6 @@
 """Health of a fleet: findings from a snapshot, clock replies and malformed messages."""
 
+import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -301,7 +302,10 @@ def reason_class(reason: str) -> str:
 def _in_the_way(reason: str) -> list[str]:
     """Arms until whose way a job waits, by its reason."""
     _, _, rest = reason.partition("It waits until ")
-    return rest.partition(" is out of the way")[0].split(", ")
+    return _OUT_OF_THE_WAY.split(rest, maxsplit=1)[0].split(", ")
+
+
+_OUT_OF_THE_WAY = re.compile(" (?:is|are) out of the way")
 
 
 def _is_at_work(fleet: FleetSnapshot) -> bool:
