@@ -426,7 +426,7 @@ def _moves(channel: str, time_s: Array, readings: Mapping[str, Array], joint: in
         speed = np.abs(qd[:-1])
         moves = speed > DRIVES_RAD_S
         return bool(speed.mean() > DRIVES_RAD_S or (speed * dt_s)[moves].sum() > LEAST_MOTION_RAD)
-    apart = np.abs(half_turn(np.diff(q)) - qd[0] * dt_s)
+    apart = np.abs(half_turn(np.diff(q) - qd[0] * dt_s))[dt_s <= 1.5 * np.median(dt_s)]  # without gaps
     return bool(qd[0] != 0.0 and apart[apart > LEAST_MOTION_RAD / 10].sum() > LEAST_MOTION_RAD)
 
 
