@@ -57,8 +57,8 @@ def main(given: list[str]) -> None:
 
 
 def fresh(folders: Iterable[Path]) -> dict[str, dict[str, object]]:
-    """Shifts with other seeds than the split's: by source of `bid_price`, and by name for other policies, their seeds and
-    trainings for each instance, and its mean reward and faults."""
+    """Shifts with other seeds than the split's: by source of `bid_price`, and by name for other policies, their seeds
+    and trainings for each instance, and its mean reward and faults."""
     of_split = {line.name: line.seed for line in manifest("test")}
     found: dict[str, dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
     for folder in folders:
