@@ -5,7 +5,7 @@ from math import fsum
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.integrate import simpson, solve_ivp
 
@@ -134,6 +134,7 @@ def test_other_contact_times_have_no_value(contact_s):
 
 @given(TEMPERATURES, TEMPERATURES, TEMPERATURES)
 def test_the_time_above_a_limit_is_that_of_a_straight_line(before_c, after_c, limit_c):
+    assume(before_c == after_c or abs(before_c - after_c) > 1e-6)  # else rounding moves the points of the line
     course = np.linspace(before_c, after_c, 20_001)
     wanted = 10.0 * np.mean(course > limit_c)
     assert seconds_above(np.array(before_c), np.array(after_c), limit_c, 10.0) == pytest.approx(wanted, abs=0.01)
