@@ -587,6 +587,13 @@ def test_a_fleet_at_a_standstill_is_told(done_s: float, state: str, able: bool, 
     assert told.good == (status == "finished" and not stands)
 
 
+def test_a_row_of_a_table_waits_for_the_named_rows_only() -> None:
+    card = {"scenario": {"jobs": [row_of_table("A"), row_of_table("A-2"), row_of_table("B-2", "A")]}}
+    jobs = (replace(record("A", 900.0), finished_s=100.0), record("A-2", 900.0, "waiting"), record("B-2", 900.0))
+    log = replace(log_of(telemetry(1000), ("arm_a", "arm_b"), (), card), jobs=jobs)
+    assert log.last_before["B-2"] == (jobs[0], 100.0)
+
+
 def test_a_job_that_was_due_before_its_release_and_never_taken_has_no_time_of_work() -> None:
     events = (event(300.0, "release", job="open-1"), event(1000.0, "warning", job=""))
     jobs = (replace(record("open-1", 60.0, "waiting"), release_s=300.0),)
