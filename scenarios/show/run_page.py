@@ -247,6 +247,9 @@ def standstill(log: ShiftLog) -> Standstill | None:
     idle_s = {arm: max((span.end_s for span in spans if span.arm == arm), default=0.0) for arm in log.arms}
     for halt in log.halts:
         idle_s |= {arm: max(idle_s[arm], halt.end_s) for arm in log.arms if halt.arm in ("", arm)}
+    absent = np.all(np.isnan(log.readings.temp_c), axis=-1)
+    for a, arm in enumerate(log.arms):
+        idle_s[arm] = max(idle_s[arm], float(log.readings.time_s[absent[:, a]].max(initial=0.0)))
     ready_s = {job.job: log.ready_s(job) for job in log.jobs if job.state == "waiting"}
     able, jobs, since_s = _able_arms(log), set[str](), dict[str, float]()
     for job, job_s in ready_s.items():
