@@ -149,7 +149,7 @@ SEVERAL_MACHINES = {
 }
 ROS2 = {
     "listen": "listen needs the TOPIC of the arm's sensor_msgs/JointState",
-    "bridge /joint_states": "bridge takes no TOPIC, as listen does: leave '/joint_states' out",
+    "bridge /joint_states": "bridge takes no TOPIC (got '/joint_states'); only listen does",
     "listen /joint_states": "has no motor temperatures",
     "listen /j --temperatures /d --joints a,a": "different names",
     "jobs": "needs the Python module 'rclpy' of ROS 2",
