@@ -395,8 +395,8 @@ def _stuck(time_s: Array, readings: Mapping[str, Array]) -> Iterator[BadReading]
                 alive = np.delete(changes[a:b], j, axis=1).mean() >= 0.5
                 if channel in ("q", "qd"):
                     alive = _moves(channel, time_s, readings, j, slice(a, b + 1))
-                elif coarse:
-                    alive = True
+                elif coarse and not padded:
+                    alive = True  # the joint moves
                 elif channel != "temp_c":
                     alive |= moved[a:b].sum() > LEAST_MOTION_RAD
                 elif span_s >= 4 * STUCK_S and not changes[a:b].any():

@@ -32,6 +32,7 @@ from scenarios.show.run_page import (
     other_choices,
     report_html,
     runs_page,
+    standstill,
     verdict,
 )
 from scenarios.show.timeline import shift_charts, stream_of
@@ -585,6 +586,20 @@ def test_a_fleet_at_a_standstill_is_told(done_s: float, state: str, able: bool, 
     assert (sentence in told.sentences) == stands
     assert ("1 job left waiting beside idle arms" in told.badge) == stands
     assert told.good == (status == "finished" and not stands)
+
+
+def test_a_row_of_a_table_waits_for_the_named_rows_only() -> None:
+    card = {"scenario": {"jobs": [row_of_table("A"), row_of_table("A-2"), row_of_table("B-2", "A")]}}
+    jobs = (replace(record("A", 900.0), finished_s=100.0), record("A-2", 900.0, "waiting"), record("B-2", 900.0))
+    log = replace(log_of(telemetry(1000), ("arm_a", "arm_b"), (), card), jobs=jobs)
+    assert log.last_before["B-2"] == (jobs[0], 100.0)
+
+
+def test_an_arm_without_recorded_states_at_the_end_is_not_idle_beside_waiting_jobs() -> None:
+    readings = telemetry(1000)
+    readings.temp_c[500:, 0] = np.nan
+    log = log_of(readings, ("arm_a",), (), {"status": "finished"})
+    assert standstill(replace(log, jobs=(record("open-1", 5000.0, "waiting"),))) is None
 
 
 def test_a_job_that_was_due_before_its_release_and_never_taken_has_no_time_of_work() -> None:

@@ -127,7 +127,7 @@ def fill_slots(t: Tables, s: State, slot_job: Array, events: EventBuffer, e: int
 
 @jit_inline
 def pass_over(sim: Simulation, rows: Array) -> None:
-    """Count that an idle arm has not taken the jobs in the slots of envs in which others wait; put old ones last.
+    """Count that an idle arm has not taken the jobs in the slots of envs in which others wait; put some of them last.
 
     Args:
         rows: Envs, int [row].

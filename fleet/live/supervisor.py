@@ -28,7 +28,8 @@ SUPERVISED = "THERMOFLEET_SUPERVISOR"
 WAITS = 75
 """Exit code of a process that waits for another, as a router: no failure (EX_TEMPFAIL of sysexits.h)."""
 NOTICES, NOTICE_S = ("Waiting for a router.", "The certificate of '"), 60.0
-"""Starts of log messages of a process that are also logged here: it is cut off. Real seconds before one is repeated."""
+"""Starts of log messages of a process that are also logged here: it is cut off, or its certificate expires soon, has
+expired or was renewed. Real seconds before one is repeated."""
 LOG_S = 1.0
 """Real seconds to wait for the last output of an exited process."""
 

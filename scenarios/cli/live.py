@@ -322,7 +322,7 @@ def ros2_command(
     if mode == "listen" and not topic:
         raise FleetError("listen needs the TOPIC of the arm's sensor_msgs/JointState, as /joint_states.")
     if topic and mode != "listen":
-        raise FleetError(f"{mode} takes no TOPIC, as listen does: leave '{topic}' out.")
+        raise FleetError(f"{mode} takes no TOPIC (got '{topic}'); only listen does.")
     from scenarios.live.ros2 import run_bridge, run_jobs, run_listener
 
     run = {"bridge": run_bridge, "listen": partial(run_listener, topic), "jobs": run_jobs}[mode]

@@ -215,7 +215,9 @@ def how_to_watch(scenario: str, at: str, tls: Path | None) -> str:
         for name in roster.of_role(role):
             if (tls / f"{file_of(name)}.key").is_file():
                 return f"To watch it: {command} {Tls(tls, name).endpoint(at)}"
-    return f"To watch it, copy monitor.pem and monitor.key to {tls}: {command} {Tls(tls, 'monitor').endpoint(at)}"
+    monitor = Tls(tls, next(iter(roster.of_role("monitor")), "monitor"))
+    files = f"{monitor.file}.pem and {monitor.file}.key"
+    return f"To watch it, copy {files} to {tls}: {command} {monitor.endpoint(at)}"
 
 
 def refuse_other_fleet(folder: Path, card: FleetCard, *, new_epoch: bool = False) -> None:

@@ -66,7 +66,7 @@ def thread_of(folder: Path, asked: str) -> Thread:
             If several events fit, the first one.
 
     Raises:
-        FleetError: no run or recording, no such event, or a job that was never awarded.
+        FleetError: no run or recording, no such event, or a job without a recorded award.
     """
     log: ShiftLog
     results: Sequence[Mapping[str, Any]] = ()
@@ -83,7 +83,7 @@ def thread_of(folder: Path, asked: str) -> Thread:
     job = asked.removeprefix("award@")
     awarded = {event.job for event in events if event.kind == "award"}
     if job in jobs and job not in awarded and not asked.isdecimal():
-        raise FleetError(_never_awarded(log, job, str(jobs[job]["state"]), events))
+        raise FleetError(_without_award(log, job, str(jobs[job]["state"]), events))
     rows = rows_of(events, asked, {notice.kind for notice in log.notices})
     event = events[rows[0]]
     work = log.plan.at(event.arm, event.time_s)
@@ -110,13 +110,13 @@ def thread_of(folder: Path, asked: str) -> Thread:
     )
 
 
-def _never_awarded(log: ShiftLog, job: str, state: str, events: Sequence[Event]) -> str:
-    """That a job was never awarded, why it is late, and its events."""
+def _without_award(log: ShiftLog, job: str, state: str, events: Sequence[Event]) -> str:
+    """That no award of a job is recorded, why it is late, and its events."""
     late = [each for each in late_jobs(log) if each.job == job]
     why = f" {lateness_text(log, late)}" if late else ""
     kinds = dict.fromkeys(event.kind for event in events if event.job == job)
     listed = f" Trace another event: {', '.join(f'{kind}@{job}' for kind in kinds)}." if kinds else ""
-    return f"'{job}' was never awarded; its state is {state.replace('_', ' ')}.{why}{listed}"
+    return f"No award of '{job}' is recorded; its state is {state.replace('_', ' ')}.{why}{listed}"
 
 
 def _recorded_jobs(results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:

@@ -376,9 +376,11 @@ class ShiftLog:
         """Of each job that waits for others the one that finishes last, and its finish, s: infinite if unfinished."""
         last = dict[str, tuple[JobRecord, float]]()
         for job in self.jobs:
-            number = job.job.rpartition("-")[2]
-            names = (name for each in self.stream(job.job).get("after", ()) for name in (each, f"{each}-{number}"))
-            before = [self.records[name] for name in names if name in self.records]
+            after = self.stream(job.job).get("after", ())
+            if job.job not in self.streams:  # a row of a table has the name of its stream
+                number = job.job.rpartition("-")[2]
+                after = [name for each in after for name in (each, f"{each}-{number}")]
+            before = [self.records[name] for name in after if name in self.records]
             ends_s = [inf if each.finished_s is None else each.finished_s for each in before]
             if before:
                 last[job.job] = max(zip(before, ends_s, strict=True), key=lambda each: each[1])

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from statistics import median
@@ -247,11 +247,14 @@ def standstill(log: ShiftLog) -> Standstill | None:
     idle_s = {arm: max((span.end_s for span in spans if span.arm == arm), default=0.0) for arm in log.arms}
     for halt in log.halts:
         idle_s |= {arm: max(idle_s[arm], halt.end_s) for arm in log.arms if halt.arm in ("", arm)}
+    absent = np.all(np.isnan(log.readings.temp_c), axis=-1)
+    for a, arm in enumerate(log.arms):
+        idle_s[arm] = max(idle_s[arm], float(log.readings.time_s[absent[:, a]].max(initial=0.0)))
     ready_s = {job.job: log.ready_s(job) for job in log.jobs if job.state == "waiting"}
-    jobs, since_s = set[str](), dict[str, float]()
+    able, jobs, since_s = _able_arms(log), set[str](), dict[str, float]()
     for job, job_s in ready_s.items():
-        offers = _offers_like(log, job)
-        for arm in _able(log, offers) if offers else log.arms:
+        candidates = _able(log, able, job)
+        for arm in log.arms if candidates is None else candidates:
             both_s = max(job_s, idle_s[arm])
             if end_s - both_s >= IDLE_S:
                 jobs.add(job)
@@ -362,7 +365,7 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
             return f"it waited for {last.job}, which finished at {clock(ready_s, log.begin)}"
         return f"it waits for {last.job}, which is not finished ({last.state.replace('_', ' ')})"
     begin_s = max(begin_s, ready_s)
-    able = _able(log, _offers_like(log, late.job))
+    able = _able(log, _able_arms(log), late.job)
     if not able:
         return "it was never awarded, and no offer for it or for a job with the same work is recorded"
     halts = {_halt(log, halt): halt for halt in log.halts if halt.start_s < late.due_s}
@@ -381,21 +384,31 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
     return f"{names_text(arms)} {be}{most}"
 
 
-def _able(log: ShiftLog, offers: Sequence[Offer]) -> list[str]:
-    """Arms that can do the job of some offers."""
-    return [arm for arm in log.arms if any(offer.feasible and offer.arm == arm for offer in offers)]
+Likeness = tuple[str, str]
+"""What two jobs have in common, and its value."""
 
 
-def _offers_like(log: ShiftLog, job: str) -> list[Offer]:
-    """Offers for a job, else for jobs of its stream, else for jobs with the same work."""
-    offers = [offer for offer in log.offers if offer.job == job]
-    offers = offers or [offer for offer in log.offers if stream_of(offer.job) == stream_of(job)]
-    if not offers and (stream := log.stream(job)):
-        names = ("kind", "places", "payload_kg", "dwell_s", "force_n")
-        streams = log.streams.values()
-        alike = {each["name"] for each in streams if all(each.get(name) == stream.get(name) for name in names)}
-        offers = [offer for offer in log.offers if {offer.job, stream_of(offer.job)} & alike]
-    return offers
+def _likenesses(log: ShiftLog, job: str) -> tuple[Likeness, ...]:
+    """Name, stream and work of a job: what offers for jobs like it have, the closest first."""
+    stream = log.stream(job)
+    work = repr([stream.get(name) for name in ("kind", "places", "payload_kg", "dwell_s", "force_n")])
+    return (("job", job), ("stream", stream_of(job)), *((("work", work),) if stream else ()))
+
+
+def _able_arms(log: ShiftLog) -> dict[Likeness, set[str]]:
+    """Arms that can do the jobs of the recorded offers, by what like jobs have in common."""
+    able = dict[Likeness, set[str]]()
+    likenesses = {job: _likenesses(log, job) for job in {offer.job for offer in log.offers}}
+    for offer in log.offers:
+        for likeness in likenesses[offer.job]:
+            able.setdefault(likeness, set()).update((offer.arm,) if offer.feasible else ())
+    return able
+
+
+def _able(log: ShiftLog, able: Mapping[Likeness, Collection[str]], job: str) -> list[str] | None:
+    """Arms that can do a job, by the offers for the job or those most like it; None without such an offer."""
+    likeness = next((each for each in _likenesses(log, job) if each in able), None)
+    return None if likeness is None else [arm for arm in log.arms if arm in able[likeness]]
 
 
 def _absence_in(span: JobSpan, event: Event) -> bool:

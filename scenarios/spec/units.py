@@ -138,7 +138,8 @@ def check_times(
             *(where, count - inside, count, horizon_s, _first_outside(times_s, horizon_s, names), question),
         )
     elif question:
-        within = f"all {len(numbers_s)} times are within {max(numbers_s):g} s of a shift of {horizon_s:g} s"
+        which = "times" if len(numbers_s) == count else f"of {count} times that are numbers"
+        within = f"all {len(numbers_s)} {which} are within {max(numbers_s):g} s of a shift of {horizon_s:g} s"
         _LOG.warning("%s: %s.%s", where, within, question)
 
 

@@ -149,7 +149,7 @@ SEVERAL_MACHINES = {
 }
 ROS2 = {
     "listen": "listen needs the TOPIC of the arm's sensor_msgs/JointState",
-    "bridge /joint_states": "bridge takes no TOPIC, as listen does: leave '/joint_states' out",
+    "bridge /joint_states": "bridge takes no TOPIC (got '/joint_states'); only listen does",
     "listen /joint_states": "has no motor temperatures",
     "listen /j --temperatures /d --joints a,a": "different names",
     "jobs": "needs the Python module 'rclpy' of ROS 2",
@@ -308,6 +308,9 @@ def test_the_command_to_watch_names_a_certificate_that_is_there(folder):
         (folder / f"{name}.key").unlink(missing_ok=True)
     sentence = f"To watch it, copy monitor.pem and monitor.key to {folder}: {command}monitor"
     assert how_to_watch("quickstart", at, folder) == sentence
+    roster = (folder / "roster.json").read_text(encoding="utf-8")
+    (folder / "roster.json").write_text(roster.replace('"name": "monitor"', '"name": "watch"'), encoding="utf-8")
+    assert how_to_watch("quickstart", at, folder) == sentence.replace("monitor", "watch")
     assert how_to_watch("quickstart", PLAIN, None).endswith(f"--endpoint {PLAIN}")
 
 

@@ -517,7 +517,10 @@ def test_clock_times_are_not_asked_to_be_minutes(tmp_path, caplog):
         caplog.clear()
         rows = [f"j{i},hold,bench,,,{time_},,,," for i, time_ in enumerate(times)]
         small_table(tmp_path, "\n".join([SHORT, *rows]))
-        assert ("Are these minutes? 3 min is 180 s." in caplog.text) == asked, times
+        assert ("all 3 times are within 3 s of a shift of 180 s. Are these minutes?" in caplog.text) == asked, times
+    rows = [f"j{i},hold,bench,,,{time_},,,," for i, time_ in enumerate(("0:01", "1", "2", "3"))]
+    small_table(tmp_path, "\n".join([SHORT, *rows]))
+    assert "all 3 of 4 times that are numbers are within 3 s of a shift of 180 s. Are these minutes?" in caplog.text
 
 
 def test_jobs_that_cannot_finish_in_time_are_told(tmp_path, caplog, plans):

@@ -366,7 +366,7 @@ def test_a_recording_has_what_arms_published_and_says_what_is_missing(tmp_path: 
     with pytest.raises(FleetError, match=r"'pause' is a request or an alarm, which has no causes .* award, return, "):
         thread_of(tmp_path, "pause")
     for asked in ("k", "award@k"):
-        why = r"'k' was never awarded; its state is waiting\. k is unfinished .* Trace another event: lost@k\."
+        why = r"No award of 'k' is recorded; its state is waiting\. k is unfinished .* Trace another event: lost@k\."
         with pytest.raises(FleetError, match=why):
             thread_of(tmp_path, asked)
     with pytest.raises(FleetError, match=r"No event 7: rows of the event log are 0 to 5"):

@@ -494,6 +494,16 @@ def test_coarse_recorders_and_slow_ones_are_not_refused(channel: str, digits: in
     assert judge(time_s[::4], slow, degrees=False) == []
 
 
+def test_a_cooling_arm_whose_angles_and_torques_are_rounded_to_zero_is_read() -> None:
+    rng, time_s = np.random.default_rng(0), np.arange(600.0)
+    q = np.tile([0.0, 0.3, 0.0, 1.0, 0.0, 0.5, 0.0], (len(time_s), 1))
+    flickers = (q != 0.0) & (rng.random(q.shape) < 0.1)
+    tau = gravity_terms(q)[:, :, 2].round() * (q != 0.0) + flickers
+    temp_c = 30.0 + np.arange(7) + 4.0 * np.exp(-time_s / 300.0)[:, None] + rng.normal(0.0, 0.02, q.shape)
+    readings = {"q": q, "qd": 0.0 * q, "tau": tau, "current_a": (0.1 * tau).round(1), "temp_c": temp_c}
+    assert judge(time_s, readings, degrees=False) == []
+
+
 @pytest.mark.parametrize("rows", [1, 5])
 @pytest.mark.parametrize("damaged", ["refuse", "skip"])
 def test_the_lines_of_two_arms_in_one_file_are_named(rows: int, damaged: str, tmp_path: Path) -> None:
