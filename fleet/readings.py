@@ -5,7 +5,7 @@ in `fleet/data/gen3_thermal.json`. Limits of the statistics leave room around 34
 """
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import resources
@@ -66,8 +66,6 @@ UPRIGHT_NM = 11.0
 """Most torque that gravity causes while all angles are within 2π degrees of zero, with 4.5 kg, N·m."""
 MISFIT = 0.05
 """Share of the squared torque that gravity leaves unexplained in a wrong log; of the public logs only one has more."""
-LARGE_JOINTS = 4
-"""Joints 1 to 4, of the large actuators."""
 BETTER = 3.0
 """Factor by which another reading of the log must reduce that share before it is named; at most 1.1 in that log."""
 BACK = 0.05
@@ -249,7 +247,7 @@ def judge_plan(time_s: Array, readings: Mapping[str, Array], *, degrees: bool) -
     bad = [*judge_time(time_s), *_out_of_range(readings, degrees)]
     if not bad and len(time_s) >= LEAST_ROWS and readings["qd"].any():  # else the speeds are those of the angles
         bad += _motion(time_s, readings, degrees)
-    return bad or unheld(readings) or list(_swapped_joints(readings))
+    return bad or unheld(readings)
 
 
 def runs(mask: Array, least: int = 1) -> list[tuple[int, int]]:
@@ -641,28 +639,7 @@ def _gravity(readings: Mapping[str, Array]) -> Iterator[BadReading]:
     q, tau = _slow(readings)
     if len(q) < 10 or np.sqrt((tau**2).mean(axis=0)).max() < LEAST_TORQUE_NM or (misfit := _misfit(q, tau)) < MISFIT:
         return
-    yield from _better(misfit, _misfit, _alternatives(q, tau))
-
-
-def _swapped_joints(readings: Mapping[str, Array]) -> Iterator[BadReading]:
-    """Torques of swapped large joints, also in a single posture: with the masses of the arm, and at most 5 kg.
-
-    Other orders and signs are not judged: a payload far from the flange may look like them.
-    """
-    q, tau = _slow(readings)
-    if len(q) and (misfit := _held_misfit(q, tau)) > MISFIT:
-        yield from _better(misfit, _held_misfit, _swaps(q, tau))
-
-
-def _held_misfit(q: Array, tau: Array) -> float:
-    return _unexplained([(q, tau)])
-
-
-def _better(
-    misfit: float, misfit_of: Callable[[Array, Array], float], readings: Iterable[tuple[Array, Array, str]]
-) -> Iterator[BadReading]:
-    """A misfit that another order, unit or sign of the joints reduces."""
-    alternatives = [(misfit_of(q, tau), meant) for q, tau, meant in readings]
+    alternatives = [(_misfit(q_, tau_), meant) for q_, tau_, meant in _alternatives(q, tau)]
     least, meant = min(alternatives, key=lambda each: each[0])
     if least * BETTER < misfit:
         what = f"the torques do not fit the angles: gravity leaves {misfit:.0%} of the squared torque unexplained"
@@ -749,13 +726,6 @@ def _alternatives(q: Array, tau: Array) -> Iterator[tuple[Array, Array, str]]:
         yield q, tau * sign, f"the other sign of the torque of joint {j + 1}"
         yield q * sign, tau, f"the other sign of the angle of joint {j + 1}"
     yield np.rad2deg(q), tau, "angles in radians"
-
-
-def _swaps(q: Array, tau: Array) -> Iterator[tuple[Array, Array, str]]:
-    for i, k in combinations(range(LARGE_JOINTS), 2):
-        order, name = _swapped(i, k), f"joints {i + 1} and {k + 1} swapped"
-        yield q, tau[:, order], f"the torques of {name}"
-        yield q[:, order], tau[:, order], name
 
 
 def _swapped(i: int, k: int) -> Array:

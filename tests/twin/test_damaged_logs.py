@@ -612,20 +612,3 @@ def test_a_plan_in_other_units_is_refused(name: str, tmp_path: Path) -> None:
             assert len(read(path, measured=False)[0].time_s) == len(time_s)
     with pytest.raises(LogError, match=question):
         read(path, measured=False)
-
-
-@pytest.mark.parametrize(("pair", "group"), [((0, 1), "Torque"), ((1, 3), "Torque"), ((1, 3), "Pos")])
-def test_a_plan_of_one_posture_with_swapped_joints_is_refused(
-    pair: tuple[int, int], group: str, tmp_path: Path
-) -> None:
-    """Seven torques do not identify mount, masses and payload; those of a Gen3 with at most 5 kg they contradict."""
-    log, path = sound(rows=30, swing=0.0, kg=1.5).plain(), tmp_path / "plan.csv"
-    for swapped in (False, True):
-        if swapped:
-            for name in {"Torque", group}:
-                log.groups[name][:, list(pair)] = log.groups[name][:, list(pair[::-1])]
-        path.write_text(log.text(PLAIN_NAMES), encoding="utf-8")
-        if not swapped:
-            assert len(read(path, measured=False)[0].time_s) == 30
-    with pytest.raises(LogError, match=f"joints {pair[0] + 1} and {pair[1] + 1} swapped it would be 0%"):
-        read(path, measured=False)
