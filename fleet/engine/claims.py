@@ -95,7 +95,7 @@ def fill_slots(t: Tables, s: State, slot_job: Array, events: EventBuffer, e: int
         if job["expires"]:
             next_s = min(next_s, job["due_s"])
         passed = job["passes"] < 0
-        if env["overfull"] and not passed:
+        if filled == slots and env["overfull"] and not passed:
             continue
         ready = True
         for n in range(s.after.shape[2]):

@@ -179,7 +179,7 @@ def cancel_command(
 
 def settle_command(
     job: str = JOB,
-    outcome: Literal["done", "redo"] = argument("done, or redo to repeat its last cycle."),
+    outcome: Literal["done", "redo"] = argument("done, or redo to do the cycles that its status does not count."),
     by: str = BY,
     endpoint: str = options.ENDPOINT,
     fleet: str = options.FLEET,

@@ -9,7 +9,7 @@ from typing import get_args
 from fleet.bus.protocol.auction import JobState
 from fleet.live.job_rules import waits_since_s
 from fleet.live.monitor.health import ALARM_KINDS, OTHER, REASONS, reason_class
-from fleet.live.monitor.snapshot import FleetSnapshot
+from fleet.live.monitor.snapshot import FleetSnapshot, bids_of
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 METRICS: Mapping[str, tuple[str, str]] = {
@@ -23,7 +23,7 @@ METRICS: Mapping[str, tuple[str, str]] = {
         "gauge",
         "Fleet seconds for which the oldest released job waits; 0 without one.",
     ),
-    "bids": ("gauge", "Open jobs for which an arm has a bid."),
+    "bids": ("gauge", "Waiting jobs for which an arm has a bid."),
     "arm_events_total": (
         "counter",
         "Events of an arm by kind, such as award, finish and fault, cached ones included.",
@@ -66,6 +66,7 @@ def samples(fleet: FleetSnapshot, alarms: Counter[tuple[str, str]]) -> Iterable[
         yield "jobs", {"state": state}, fleet.counts.get(state, 0)
         yield "job_changes_total", {"state": state}, fleet.changes.get(state, 0)
     waiting = [status for status in fleet.jobs if status.state == "waiting"]
+    names = {status.job for status in waiting}
     reasons = Counter(reason_class(status.reason) for status in waiting)
     for reason in dict.fromkeys((*REASONS.values(), OTHER)):
         yield "waiting_jobs", {"reason": reason}, reasons[reason]
@@ -75,7 +76,7 @@ def samples(fleet: FleetSnapshot, alarms: Counter[tuple[str, str]]) -> Iterable[
         yield "oldest_waiting_seconds", {}, max(0.0, now_s - min(since_s, default=now_s))
     for arm in fleet.arms:
         own = {"arm": arm.arm}
-        yield "bids", own, len(arm.scores)
+        yield "bids", own, bids_of(arm, names)
         yield from (("arm_events_total", {**own, "kind": kind}, count) for kind, count in arm.events.items())
         yield from (
             ("motor_temperature_celsius", {**own, "joint": str(joint)}, temp_c)

@@ -175,3 +175,15 @@ def test_no_number_of_jobs_that_nobody_takes_stops_the_others(small, wanted, slo
     world, plant = small.shop([jobs], arms=1, slots=slots, ticks=ticks)
     _, state = play_one(world, plant, claims)
     assert (state.status[0, :count] == DONE).tolist() == wanted
+
+
+def test_a_new_job_has_a_slot_at_once_beside_jobs_that_were_passed_over(small) -> None:
+    new_s = 5 * MOST_PASSES * 10.0
+    jobs = [small.job(f"old_{i}", small.work("bench")) for i in range(9)]
+    world, plant = small.shop(
+        [[*jobs, small.job("new", small.work("bench"), release_s=new_s)]], arms=1, slots=4, ticks=6 * MOST_PASSES
+    )
+    slots, _ = play_one(world, plant, ())
+    shown = [9 in each for each in slots]
+    assert shown[5 * MOST_PASSES : 6 * MOST_PASSES] == [True] * MOST_PASSES
+    assert not any(shown[: 5 * MOST_PASSES])

@@ -9,7 +9,7 @@ from msgspec import structs
 from fleet.bus.protocol.auction import NOT_PLANNED, JobEstimate, JobSpec, PlanQuote, Quote, QuoteRequest
 from fleet.bus.protocol.messages import State
 from fleet.live.auction.auctioneer import Auctioneer
-from fleet.live.auction.rounds import Assignment, Bidding, reason_to_wait
+from fleet.live.auction.rounds import MAX_REASON, Assignment, Bidding, no_arm_can, reason_to_wait
 from fleet.live.book import JobBook
 from fleet.live.job_rules import why_not_ready
 from fleet.live.journal import JobsAccepted
@@ -183,3 +183,18 @@ def test_a_lease_that_ends_while_the_auctioneer_is_stopped_is_not_blamed_on_its_
     assert book.status_of(book.jobs["j"]).reason == reason
     book.record(closed("w:j", "returned", 0, 6.0, "the award was revoked"))  # the arm knows no more
     assert book.status_of(book.jobs["j"]).reason == reason
+
+
+def test_what_few_of_many_arms_say_of_a_job_is_not_cut_off() -> None:
+    reasons = {
+        f"arm_{i}": f"at 'clamp': reach: {2 + i / 7:.2f} m from the base of the arm, which reaches 0.90 m"
+        for i in range(16)
+    }
+    reasons["arm_6"] = reasons["arm_7"] = "9 kg is beyond the rating of 4.5 kg"
+    assert no_arm_can(reasons) == (
+        "No arm can do it: arm_6: 9 kg is beyond the rating of 4.5 kg (1 more alike); "
+        "arm_0: at 'clamp': reach: 2.00 m from the base of the arm, which reaches 0.90 m (13 more alike)."
+    )
+    many = no_arm_can({f"arm_{i}": "x" * i for i in range(16, 64)})
+    assert len(many) == MAX_REASON
+    assert many.endswith("…")

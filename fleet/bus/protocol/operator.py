@@ -52,8 +52,9 @@ class Cancel(msgspec.Struct, frozen=True, tag_field="action", tag="cancel"):
 class Settle(msgspec.Struct, frozen=True, tag_field="action", tag="settle"):
     """Resolve an `unfinished` job, after inspecting the cell.
 
-    done: it is finished. redo: its last cycle was not done, and an arm does it again; refused while an arm that could
-    still do it has the award: stop that arm and free its space with `jobs/clear` first.
+    done: it is finished. redo: it is not, and an arm does the cycles beyond `cycles` of its status, of short ones
+    several; refused while an arm that could still do them has the award: stop that arm and free its space with
+    `jobs/clear` first.
     """
 
     job: JobName

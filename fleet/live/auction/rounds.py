@@ -8,6 +8,7 @@ Rounds of an auction: which jobs are offered when, to whom, and what is awarded.
 import dataclasses
 import logging
 import math
+import re
 from collections import defaultdict
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
@@ -45,6 +46,8 @@ _LOG = logging.getLogger(__name__)
 
 MAX_REASON = 500
 """Characters of a reason, so that a message does not grow with the number of arms."""
+_NUMBER = re.compile(r"\d[\d.]*")
+"""What differs in the same reason of two arms."""
 MOST_ABSENT = 3
 """Absent arms that a reason names."""
 MOST_UNANSWERED = 3
@@ -243,8 +246,22 @@ def no_arm_can(reasons: Mapping[str, str], *, all_known: bool = True) -> str:
     Args:
         all_known: Whether all present arms have answered.
     """
-    each = "; ".join(f"{arm}: {reason}" for arm, reason in sorted(reasons.items()))
-    return f"No arm {'' if all_known else 'that has answered '}can do it: {each}."[:MAX_REASON]
+    start = f"No arm {'' if all_known else 'that has answered '}can do it: "
+    each = start + "; ".join(f"{arm}: {reason}" for arm, reason in sorted(reasons.items())) + "."
+    if len(each) <= MAX_REASON:
+        return each
+    alike: dict[str, list[str]] = defaultdict(list)
+    for arm, reason in sorted(reasons.items()):
+        alike[_NUMBER.sub("", reason)].append(arm)
+    parts = [
+        f"{first}: {reasons[first]}" + (f" ({len(more)} more alike)" if more else "")
+        for first, *more in sorted(alike.values(), key=len)
+    ]
+    return _short(f"{start}{'; '.join(parts)}.")
+
+
+def _short(reason: str) -> str:
+    return reason if len(reason) <= MAX_REASON else f"{reason[: MAX_REASON - 1]}…"
 
 
 def reason_to_wait(bidding: Bidding, job: str) -> str:
@@ -255,7 +272,7 @@ def reason_to_wait(bidding: Bidding, job: str) -> str:
     able = {arm: each.plans for arm, each in estimates.items() if each.feasible}
     if offered := {arm: plans for arm in able if (plans := bidding.plans(arm, job))}:
         late = _lateness(bidding, job, (plan for plans in offered.values() for plan in plans.values()))
-        return f"The policy lets it wait: {late}{', '.join(offered)} could begin it."[:MAX_REASON]
+        return _short(f"The policy lets it wait: {late}{', '.join(offered)} could begin it.")
     refusals = {
         arm: each.reason or "infeasible" for arm, each in estimates.items() if not each.feasible and arm not in excluded
     }
@@ -276,7 +293,7 @@ def reason_to_wait(bidding: Bidding, job: str) -> str:
     reasons += [f"{_not_present(in_way & bidding.absent)}."] if in_way & bidding.absent else []
     taken = [f"{arm} {_why_without_capacity(bidding, arm)}" for arm in able if arm in bidding.full]
     reasons += [f"{', '.join([*taken, *others])}."] if taken or others else []
-    return " ".join(reasons)[:MAX_REASON]
+    return _short(" ".join(reasons))
 
 
 def _no_arm(refusals: Mapping[str, str], others: Sequence[str], asked: str) -> str:
@@ -290,7 +307,7 @@ def _no_arm(refusals: Mapping[str, str], others: Sequence[str], asked: str) -> s
     if not others:
         return no_arm_can(refusals) if refusals else "No arm has answered whether it can do it."
     start = f"No {asked} that was asked can do it, and " if refusals else ""
-    return f"{start}{', '.join(others)}."[:MAX_REASON]
+    return _short(f"{start}{', '.join(others)}.")
 
 
 def _not_present(arms: Iterable[str]) -> str:
@@ -640,7 +657,7 @@ class Rounds:
             return "All present arms are paused."
         left_out = {arm: self.back_offs.why_no_job(arm, self.now_s[0]) for arm in able}
         if all(left_out.values()):
-            return f"{', '.join(f'{arm} {why}' for arm, why in left_out.items())}."[:MAX_REASON]
+            return _short(f"{', '.join(f'{arm} {why}' for arm, why in left_out.items())}.")
         if reason := why_not_ready(job, self.now_s[1], book.is_finished, busy):
             return reason
         most, soon = self._timing.max_jobs, "It waits to be offered in the next round."

@@ -7,6 +7,7 @@ fleet.
 
 import logging
 import math
+import re
 import time
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Container, Mapping, Sequence
@@ -567,11 +568,17 @@ def why_idle(arm: ArmSnapshot, waiting: Mapping[str, str], fleet: FleetSnapshot,
         return f"It {fleet.left_out[arm.arm]}."
     if not waiting:
         return "No job waits."
-    named = next((f" {job}: {reason}" for job, reason in waiting.items() if arm.arm in reason), "")
-    able = sum(job in waiting and score != JobScore() for job, score in arm.scores.items())
+    word = re.compile(rf"(?<!\w){re.escape(arm.arm)}(?!\w)")
+    named = next((f" {job}: {reason}" for job, reason in waiting.items() if word.search(reason)), "")
+    named = "" if arm.arm in fleet.space else named  # of an arm in the way the sentence is about others
     others = ", ".join(sorted(fleet.space.keys() - {arm.arm}))
     in_way = f" Space is closed by {others}, which may be in its way." if others else ""
-    return f"It has bids for {able} of {len(waiting)} waiting jobs.{in_way}{named}"
+    return f"It has bids for {bids_of(arm, waiting)} of {len(waiting)} waiting jobs.{in_way}{named}"
+
+
+def bids_of(arm: ArmSnapshot, waiting: Container[str]) -> int:
+    """Number of the waiting jobs that an arm has said it can do."""
+    return sum(job in waiting and score != JobScore() for job, score in arm.scores.items())
 
 
 def _age_s(at_s: float | None, now_s: float) -> float | None:
