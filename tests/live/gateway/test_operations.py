@@ -22,7 +22,7 @@ from fleet.errors import FleetError
 from fleet.live.auction.rounds import NOT_OFFERED
 from fleet.live.monitor import alarms, async_bridge
 from fleet.live.monitor.async_bridge import AsyncBridge
-from fleet.live.monitor.snapshot import ArmSnapshot, AuctioneerSnapshot, FleetListener, FleetSnapshot
+from fleet.live.monitor.snapshot import ArmSnapshot, AuctioneerSnapshot, FleetListener, FleetSnapshot, JobScore
 from scenarios.live import webhooks
 from scenarios.live.metrics import METRICS, exposition
 from scenarios.live.webhooks import MOST_WAITING, Webhook
@@ -64,7 +64,8 @@ FLEET = FleetSnapshot(
     "f",
     (
         ArmSnapshot(ODD, True, True, time_s=100.0, temp_c=(40.0, 55.5), headroom_k=4.5, p_saturation=0.25,
-                    events={"award": 3}, worked_s=60.0, heat_n2m2s=12.5, state_age_s=0.5),
+                    events={"award": 3}, worked_s=60.0, heat_n2m2s=12.5, state_age_s=0.5,
+                    scores={"j": JobScore(difficulty=0.5), "k": JobScore(), "ended": JobScore(difficulty=0.5)}),
         ArmSnapshot("b", False, False),
     ),
     (AuctioneerSnapshot("au", True, 1.5),),
@@ -94,6 +95,7 @@ def test_the_metrics_are_in_the_text_format_of_prometheus():
     assert value("p_saturation", arm=ODD) == 0.25
     assert value("arm_events_total", arm=ODD, kind="award") == 3
     assert value("silence_seconds", participant="au", role="auctioneer") == 1.5
+    assert (value("bids", arm=ODD), value("bids", arm="b")) == (1, 0)
     assert value("present", arm="b") == 0
     assert value("alarms", kind="fault", acknowledged="no") == 1
 
