@@ -65,8 +65,9 @@ class Webhook:
         if parts.scheme == "http" and not _is_loopback(host):
             raise FleetError(f"--webhook beyond this machine must be https:// (got '{printable(url)}').")
         self._port = port or (443 if parts.scheme == "https" else 80)
-        self.url, self.problem, self._secret, self._host = url, "", secret.encode(), host
+        self.problem, self._secret, self._host = "", secret.encode(), host
         self._named = f"[{host}]" if ":" in host else host
+        self._target = f"{self._named}:{self._port}"
         self._tls = ssl.create_default_context() if parts.scheme == "https" else None
         self._path = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
         self._waiting: deque[bytes] = deque(maxlen=MOST_WAITING)
@@ -75,7 +76,7 @@ class Webhook:
     def send(self, alarm: Alarm) -> None:
         """Queue an alarm."""
         if len(self._waiting) == MOST_WAITING:
-            _LOG.warning("'%s' is %d alarms behind; the oldest is dropped.", self.url, MOST_WAITING)
+            _LOG.warning("The webhook at %s is %d alarms behind; the oldest is dropped.", self._target, MOST_WAITING)
         self._waiting.append(encode(alarm))
         self._woken.set()
 
@@ -94,7 +95,7 @@ class Webhook:
                 if not problem:
                     break
                 if final and attempt >= len(RETRY_S):
-                    _LOG.error("'%s' did not accept an alarm (%s): it is dropped there.", self.url, problem)
+                    _LOG.error("The webhook at %s refuses an alarm (%s): it is dropped there.", self._target, problem)
                     break
                 await asyncio.sleep(RETRY_S[min(attempt, len(RETRY_S) - 1)])
 
@@ -102,8 +103,8 @@ class Webhook:
         """A warning while the target accepts nothing; without the path of the URL, which may be secret."""
         if not (problem := self.problem):
             return ()
-        target = f"{self._named}:{self._port}"
-        return (Finding("warning", f"The webhook at {target} accepts no alarms: {problem}.", "webhook", target),)
+        what = f"The webhook at {self._target} accepts no alarms: {problem}."
+        return (Finding("warning", what, "webhook", self._target),)
 
     async def _attempt(self, body: bytes) -> tuple[str, bool]:
         """Send one request; return why it was not accepted, or "", and whether the target judged this alarm."""
@@ -121,7 +122,7 @@ class Webhook:
         at = str(int(time.time()))
         signature = hmac.new(self._secret, at.encode() + b"." + body, hashlib.sha256).hexdigest()
         head = (
-            f"POST {self._path} HTTP/1.1\r\nHost: {self._named}:{self._port}\r\nContent-Type: application/json\r\n"
+            f"POST {self._path} HTTP/1.1\r\nHost: {self._target}\r\nContent-Type: application/json\r\n"
             f"Content-Length: {len(body)}\r\nX-Thermofleet-Signature: t={at},v1={signature}\r\n"
             "Connection: close\r\n\r\n"
         )
