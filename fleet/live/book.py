@@ -52,6 +52,7 @@ from fleet.job import reason_to_give_up
 from fleet.live.job_rules import (
     EXPIRED,
     MAX_OPEN_JOBS,
+    NONE_RESERVED,
     SHIFT_ENDED,
     PastJobs,
     admit,
@@ -258,12 +259,17 @@ class JobBook(TimedState[BookRecord]):
         return self._in_order
 
     def admit(
-        self, jobs: Sequence[JobSpec], time_s: float, later: Mapping[str, JobSpec] | None = None
+        self,
+        jobs: Sequence[JobSpec],
+        time_s: float,
+        later: Mapping[str, JobSpec] | None = None,
+        reserved: Mapping[str, JobSpec] = NONE_RESERVED,
     ) -> tuple[Admission, ...]:
         """Return which submitted jobs can be accepted at a fleet time; changes nothing.
 
         Args:
             later: Jobs that will be accepted, by name.
+            reserved: As of `fleet.live.job_rules.admit`.
         """
         named = [name for job in jobs for name in (job.name, *job.after)]
         entries = {name: self.jobs[name] for name in named if name in self.jobs}
@@ -273,6 +279,7 @@ class JobBook(TimedState[BookRecord]):
         return admit(
             jobs,
             {**(later or {}), **known},
+            reserved=reserved,
             places=self.places,
             count=len(self.jobs) - len(self.settled),
             ended=self.ended,

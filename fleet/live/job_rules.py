@@ -127,12 +127,14 @@ def reason_to_follow(before: str) -> str:
 
 
 NONE_ENDED: Mapping[str, str] = {}
+NONE_RESERVED: Mapping[str, JobSpec] = {}
 
 
 def admit(
     jobs: Sequence[JobSpec],
     known: Mapping[str, JobSpec],
     *,
+    reserved: Mapping[str, JobSpec] = NONE_RESERVED,
     places: frozenset[str] | None = None,
     count: int | None = None,
     limit: int = MAX_OPEN_JOBS,
@@ -147,6 +149,7 @@ def admit(
     Args:
         known: Jobs that were accepted before, at least those that the submission names. An identical job is accepted
             again and changes nothing.
+        reserved: Jobs of the scenario, by name, that are submitted once released: no other job may have their names.
         places: Places of the cell; None allows any name.
         count: Open jobs; by default all known ones.
         ended: Whether the shift is over.
@@ -168,6 +171,8 @@ def admit(
             continue
         elif same_name is not None or job.name in past:
             rejected[index] = f"Another job has the name '{job.name}'; names must be unique."
+        elif reserved.get(job.name, job) != job:
+            rejected[index] = f"The scenario has another job '{job.name}', released later; give this one another name."
         elif unknown:
             rejected[index] = f"No place '{unknown[0]}' in this cell. Places: {listed(sorted(places or ()))}."
         elif count + len(new) >= limit:

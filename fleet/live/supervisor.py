@@ -25,6 +25,8 @@ READY = "ready "
 """Start of the line that a participant prints once it has started."""
 SUPERVISED = "THERMOFLEET_SUPERVISOR"
 """Environment variable of supervised processes: the process id of the supervisor."""
+PROCESS_NAME = "THERMOFLEET_PROCESS_NAME"
+"""Environment variable of supervised processes: the name of the part."""
 WAITS = 75
 """Exit code of a process that waits for another, as a router: no failure (EX_TEMPFAIL of sysexits.h)."""
 NOTICES, NOTICE_S = ("Waiting for a router.", "The certificate of '"), 60.0
@@ -253,10 +255,11 @@ class Supervisor:
         part = running.part
         running.ready.clear()
         running.began_s = time.monotonic()
-        env = {**os.environ, "PYTHONUNBUFFERED": "1", SUPERVISED: str(os.getpid()), **part.env}
+        env = {**os.environ, "PYTHONUNBUFFERED": "1", SUPERVISED: str(os.getpid()), PROCESS_NAME: part.name}
+        env |= part.env
         run, words = None, part.argv[len(self._program) :]
         if self._main is not None and part.argv == (*self._program, *words) and _may_fork():
-            run = partial(_run_in_fork, self._main, part.name, words, env)
+            run = partial(_run_in_fork, self._main, words, env)
         process = subprocess.Popen(
             part.argv,
             stdin=subprocess.DEVNULL,
@@ -332,9 +335,7 @@ def _may_fork() -> bool:
     return sys.platform == "linux" and len(os.listdir("/proc/self/task")) == threading.active_count()
 
 
-def _run_in_fork(
-    main: Callable[[Sequence[str]], object], name: str, words: Sequence[str], env: Mapping[str, str]
-) -> NoReturn:
+def _run_in_fork(main: Callable[[Sequence[str]], object], words: Sequence[str], env: Mapping[str, str]) -> NoReturn:
     """Run a command line in this fork of the supervisor, whose `Popen` would execute it after the return."""
     code: object = 1
     try:
@@ -353,7 +354,6 @@ def _run_in_fork(
             numpy.random.seed()  # or a policy that uses it would draw the same numbers in every process
         logging.getLogger().handlers.clear()
         sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
-        ctypes.CDLL(None).prctl(15, name.encode()[:15])  # PR_SET_NAME: shown by `ps` and `top`
         gc.enable()  # `Popen` disables it meanwhile
         main(words)
         code = 0
@@ -377,6 +377,17 @@ def return_memory() -> None:
     gc.collect()
     if sys.platform == "linux":
         getattr(ctypes.CDLL(None), "malloc_trim", int)(0)
+
+
+def name_process() -> None:
+    """Give this process the name of its part, shown by `ps` and `top`; called by participants in their main thread.
+
+    Only Linux can do so (prctl(2), PR_SET_NAME; 15 bytes); elsewhere, and without a supervisor, it does nothing.
+    """
+    name = os.environ.get(PROCESS_NAME)
+    is_supervised = os.environ.get(SUPERVISED) == str(os.getppid())  # not a descendant that inherits the variables
+    if name is not None and is_supervised and sys.platform == "linux":
+        ctypes.CDLL(None).prctl(15, name.encode()[:15])
 
 
 def exit_with_supervisor() -> None:

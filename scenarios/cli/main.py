@@ -17,7 +17,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from fleet.errors import FleetError, JournalFull, NoRouter, printable, visible
-from fleet.live.supervisor import SUPERVISED, WAITS
+from fleet.live.supervisor import SUPERVISED, WAITS, name_process
 from scenarios.cli.options import with_fields
 from scenarios.extras import missing_extra
 from scenarios.terminal import INTERRUPTED, Interrupted, echo, err_console, say
@@ -206,6 +206,7 @@ def _given(error: typer.TyperException, words: Sequence[str]) -> str | None:
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line. Exit codes: 2 for an error that the user can correct, with one sentence; 130 for Ctrl-C."""
     _log_warnings()
+    name_process()
     # The matrices of an arm are small: threads of NumPy's library would only wait for each other. Torch has its own.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:

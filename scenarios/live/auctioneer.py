@@ -145,6 +145,7 @@ def run_auctioneer(scenario: Scenario, name: str, spec: LiveSpec, endpoint: str)
             excludes=excludes,
             new_epoch=spec.new_epoch,
             cell=cell,
+            reserved={job.name: job for _, job in own},
         )
         for sentence in other_versions(endpoint, fleet):
             _LOG.error("Refused: %s", sentence)

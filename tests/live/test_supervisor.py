@@ -211,12 +211,14 @@ threading.Event().wait(60)
 FORKS = """
 import os, signal, sys
 from pathlib import Path
-from fleet.live.supervisor import Backoff, Part, Supervisor, exit_with_supervisor, share_memory
+from fleet.live.supervisor import Backoff, Part, Supervisor, exit_with_supervisor, name_process, share_memory
 BALLAST = [object() for _ in range(100_000)]
 def main(words):
     exit_with_supervisor()
+    name_process()
     ignores = signal.getsignal(signal.SIGPIPE) == signal.SIG_IGN  # a client that hangs up is no end of a process
-    print("ready", *words, os.environ["GIVEN"], len(BALLAST), os.getsid(0) == os.getpid() and ignores, flush=True)
+    comm = Path("/proc/self/comm").read_text().strip()
+    print("ready", *words, comm, os.environ["GIVEN"], len(BALLAST), os.getsid(0) == os.getpid() and ignores, flush=True)
     if words == ["exits"]:
         sys.exit(3)
     signal.pause()
@@ -248,6 +250,6 @@ def test_command_lines_of_the_program_are_forks_that_share_its_memory(tmp_path, 
     while not exited(child) and time.monotonic() < deadline_s:
         threading.Event().wait(0.02)
     assert exited(child)
-    assert (tmp_path / "a.log").read_text() == "ready stays a 100000 True\n"
-    assert (tmp_path / "b.log").read_text().count("ready exits b 100000 True\n") >= 2
+    assert (tmp_path / "a.log").read_text() == "ready stays a a 100000 True\n"
+    assert (tmp_path / "b.log").read_text().count("ready exits b b 100000 True\n") >= 2
     assert "'b' exited with code 3" in done.stderr

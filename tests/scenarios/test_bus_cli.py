@@ -26,6 +26,7 @@ from fleet.bus.security.tls import Tls, identified
 from fleet.errors import FleetError
 from fleet.live.arm.awards import ArmRecord, Closed
 from fleet.live.journal import Journal
+from fleet.live.supervisor import Supervisor
 from scenarios.cli.main import main
 from scenarios.live.fleet_processes import chosen_arms, free_port, how_to_watch, parts_of
 from scenarios.live.gateway import ROLES, check, check_token, permitted_role, read_tokens, run_gateway
@@ -284,6 +285,15 @@ def test_up_gives_every_process_its_own_certificate_and_the_router_here_or_elsew
     assert router.argv[router.argv.index("--host") + 1] == "0.0.0.0"
     assert router.ready == "tls/127.0.0.1:7447"
     assert parts_of("quickstart", names, spec, host="fd00::1", **options)[0].ready == "tls/[fd00::1]:7447"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs prctl(2) of Linux")
+def test_a_process_of_up_that_is_no_fork_has_the_name_of_its_part(tmp_path):
+    spec = LiveSpec(fleet="quickstart", difficulty="blind")
+    router, *_ = parts_of("quickstart", ("arm_0",), spec, port=free_port(), folder=tmp_path)
+    with Supervisor(tmp_path / "logs") as supervisor:
+        supervisor.start(router, ready_s=PATIENCE_S)
+        assert Path(f"/proc/{supervisor.pid('router')}/comm").read_text() == "router\n"
 
 
 def test_a_part_of_a_fleet_that_waits_for_its_router_says_so_and_is_not_up(small_toml, tmp_path):

@@ -408,6 +408,16 @@ def test_submitted_jobs_survive_a_kill(endpoint, tmp_path, thermofleet):
         assert "Continuing from" in err
 
 
+def test_a_table_with_the_name_of_a_later_job_of_the_scenario_is_refused_in_its_row(endpoint, tmp_path, thermofleet):
+    name = scenario_jobs(load("quickstart"), 0)[-1][1].name
+    table = tmp_path / "jobs.csv"
+    table.write_text(f"name,kind,places\na,hold,belt\n{name},hold,belt\n")
+    with commands.ready("bus", "auctioneer", "quickstart", "--endpoint", endpoint, "--journal", tmp_path):
+        code, out, _ = thermofleet("job", "submit", table, "--endpoint", endpoint, "--fleet", "quickstart")
+    refusal = f"The scenario has another job '{name}', released later; give this one another name."
+    assert (code, out.splitlines()) == (1, ["a: accepted", f"{name}: refused: {table}, row 3, column name: {refusal}"])
+
+
 def test_jobs_are_read_from_lines_or_a_list(tmp_path):
     other = {**HOLD, "name": "b"}
     lines, listed = tmp_path / "jobs.jsonl", tmp_path / "jobs.json"

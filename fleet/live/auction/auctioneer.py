@@ -8,7 +8,7 @@ of `fleet.live.book`. An award is sent until its arm answers; one whose lease en
 import logging
 import math
 from collections import deque
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Callable, Container, Iterable, Mapping
 
 from msgspec.structs import replace
 
@@ -33,7 +33,7 @@ from fleet.errors import Refused
 from fleet.live.auction.rounds import SCAN_S, Allocate, Out, Rounds, retaken_space, space_of
 from fleet.live.book import JobBook
 from fleet.live.epochs import adopted
-from fleet.live.job_rules import finish_s, joined_reasons
+from fleet.live.job_rules import NONE_RESERVED, finish_s, joined_reasons
 from fleet.live.journal import JobsAccepted, Released
 from fleet.live.leases import Timing, clear, expire, no_progress, progress, renewal, send_again, unanswered, was_stopped
 from fleet.live.records import MAX_REASON, JobEntry, JobSettled, ShiftEnded, outcome_of, requested_job
@@ -82,9 +82,19 @@ class Auctioneer:
 
     # Messages
 
-    def submit(self, submission: Submission, real_s: float, time_s: float) -> SubmissionReply:
-        """Accept jobs; every accepted one is on disk when this returns."""
-        admissions = self.book.admit(submission.jobs, time_s)
+    def submit(
+        self,
+        submission: Submission,
+        real_s: float,
+        time_s: float,
+        reserved: Mapping[str, JobSpec] = NONE_RESERVED,
+    ) -> SubmissionReply:
+        """Accept jobs; every accepted one is on disk when this returns.
+
+        Args:
+            reserved: As of `fleet.live.job_rules.admit`.
+        """
+        admissions = self.book.admit(submission.jobs, time_s, reserved=reserved)
         accepted = {job.name: job for job, reply in zip(submission.jobs, admissions, strict=True) if reply.accepted}
         new = tuple(j for name, j in accepted.items() if name not in self.book.jobs and name not in self.book.past)
         if new:

@@ -13,6 +13,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Ack,
     Announcement,
+    JobSpec,
     JobStatus,
     Lease,
     LeaseRequest,
@@ -38,6 +39,7 @@ from fleet.live.book import JobBook
 from fleet.live.clock import FleetClock
 from fleet.live.desk import JobDesk
 from fleet.live.epochs import REMEDY, REPLY_S, ask_arms, check_begin, describe, kept_time_s
+from fleet.live.job_rules import NONE_RESERVED
 from fleet.live.journal import EpochBegun, Journal, Started, TimeRecorder, own_records
 from fleet.live.leases import Timing
 from fleet.live.monitor.snapshot import FRESH_S
@@ -147,6 +149,7 @@ class AuctionNode(JobDesk):
         excludes: Excludes = no_conflicts,
         new_epoch: bool = False,
         cell: Cell | None = None,
+        reserved: Mapping[str, JobSpec] = NONE_RESERVED,
     ) -> None:
         """Continue from a journal.
 
@@ -159,13 +162,15 @@ class AuctionNode(JobDesk):
             excludes: Which plans of two arms exclude each other.
             cell: Reply to requests for the cell; None refuses them.
             new_epoch: Begin with an empty journal even if arms know an older one.
+            reserved: Jobs, by name, whose names only `submit` may use; requests for other jobs of these names are
+                refused.
 
         Raises:
             BusError: the fleet has an auctioneer already, or the journal is empty and arms know an older one.
             JournalError: the journal is damaged, of another auctioneer, or has no space.
         """
         super().__init__(name, speed, cell)
-        self._link, self.journal = link, journal
+        self._link, self.journal, self._reserved = link, journal, reserved
         self._timing = timing or Timing()
         self._check_no_auctioneer()
         book = self.book = JobBook(places, arms).replay(own_records(journal, name))
@@ -236,12 +241,12 @@ class AuctionNode(JobDesk):
         self._send()
 
     def submit(self, submission: Submission) -> SubmissionReply:
-        """Accept jobs.
+        """Accept jobs, also under reserved names.
 
         Raises:
             Refused: no job is accepted: the journal has no space, or there is another auctioneer.
         """
-        reply = self._submit(submission)
+        reply = self._accept_jobs(submission, NONE_RESERVED)
         self._send()
         return reply
 
@@ -322,10 +327,13 @@ class AuctionNode(JobDesk):
         return {**late, **self.auctioneer.rounds.back_offs.unanswering}
 
     def _submit(self, submission: Submission) -> SubmissionReply:
+        return self._accept_jobs(submission, self._reserved)
+
+    def _accept_jobs(self, submission: Submission, reserved: Mapping[str, JobSpec]) -> SubmissionReply:
         self._check_alone("no jobs are accepted")
         if self._epochs.objection:
             raise RefusedForNow(self._epochs.objection)
-        return self.auctioneer.submit(submission, *self._now())
+        return self.auctioneer.submit(submission, *self._now(), reserved)
 
     def _clear(self, request: ClearRequest) -> Cleared:
         self._check_alone("no space is cleared")

@@ -439,6 +439,27 @@ def submit(bus, *names):
     return reply
 
 
+def test_another_job_may_not_have_the_name_of_a_job_of_the_scenario_that_is_released_later(bus):
+    (own,) = bus.jobs("load-004")
+    node = bus.auctioneer(reserved={own.name: own})
+    other, follower, free = (
+        JobSpec("load-004", "hold", ("bin",)),
+        JobSpec("b", "hold", ("bin",), after=("load-004",)),
+        JobSpec("load-4", "hold", ("bin",)),
+    )
+    (reply,) = bus.ask(
+        keys.of_jobs("f", "submit"), Submission((other, follower, free)), SubmissionReply
+    ).messages.values()
+    assert [job.reason for job in reply.jobs] == [
+        "The scenario has another job 'load-004', released later; give this one another name.",
+        "It waits for 'load-004', which is unknown or was not accepted.",
+        "",
+    ]
+    assert node.submit(Submission((own,))).jobs[0].accepted
+    assert submit(bus, "load-004").jobs[0].accepted  # the same job
+    assert node.book.jobs["load-004"].spec == own
+
+
 def lose(bus, node):
     """Stop an auctioneer and delete its journal."""
     bus.kill(node)
