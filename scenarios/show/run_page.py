@@ -751,13 +751,14 @@ def _counted(counts: Mapping[str, int]) -> str:
 
 
 def _provenance(run: Mapping[str, Any]) -> Table:
-    """Everything else in `run.json`."""
+    """Everything else in `run.json`; the cell of an unknown value is empty."""
     rows = list[tuple[str, str]]()
     scenario = {f"scenario {k}": v for k, v in run.get("scenario", {}).items() if k not in ("name", "description")}
     rest = {k: v for k, v in run.items() if k not in ("scenario", "status", "policy", "seed")}
     for key, value in (rest | scenario).items():
         parts = value.items() if isinstance(value, Mapping) else [("", value)]
-        rows += [(f"{key} {part}".strip(), value_text(inner)) for part, inner in parts]
+        texts = [(part, "" if inner is None else value_text(inner)) for part, inner in parts]
+        rows += [(f"{key} {part}".strip(), text) for part, text in texts]
     return Table(head=("", ""), rows=tuple(rows), numbers=False)
 
 
