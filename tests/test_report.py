@@ -558,6 +558,47 @@ def test_a_row_of_a_table_that_was_never_awarded_has_a_reason(card, finished_s: 
     assert lateness_text(log, [late]) == f"A2 is unfinished 8 min 20 s after its due date: {reason}."
 
 
+HOLDS = {"name": "hold", "kind": "hold", "places": ["a"], "payload_kg": [0.5, 2.5]}
+NOT_RECORDED = "it was never awarded, and no offer for it or for a job with the same work is recorded"
+PLACE_TAKEN = "arm_a was idle: the job's place was taken, or the policy let the job wait"
+
+
+@pytest.mark.parametrize(
+    ("streams", "payload_kg", "reason"),
+    [
+        ([], 2.5, NOT_RECORDED),
+        ([HOLDS], 2.5, PLACE_TAKEN),
+        ([HOLDS], 0.5, NOT_RECORDED),
+        ([HOLDS | {"name": "hold-250"}, HOLDS | {"name": "hold-251"}], 2.5, PLACE_TAKEN),
+        ([HOLDS | {"name": "hold-250"}, HOLDS | {"name": "hold-251", "places": ["b"]}], 2.5, NOT_RECORDED),
+    ],
+    ids=["submitted jobs", "a stream", "another payload", "rows alike", "another place"],
+)
+def test_offers_for_another_job_count_only_if_its_recorded_work_is_the_same(
+    streams: list[dict[str, Any]], payload_kg: float, reason: str
+) -> None:
+    readings = telemetry(1000)
+    log = replace(
+        log_of(
+            replace(readings, temp_c=np.full(readings.temp_c.shape, 30.0)),
+            ("arm_a", "arm_b"),
+            card={"scenario": {"jobs": streams}},
+        ),
+        jobs=(
+            replace(record("hold-250", 500.0, "waiting"), payload_kg=2.5),
+            replace(record("hold-251", 900.0), payload_kg=payload_kg),
+        ),
+        offers=(offered("hold-251", 10.0, 100.0),),
+    )
+    assert lateness_text(log, late_jobs(log)).endswith(f": {reason}.")
+
+
+def test_an_arm_that_was_awarded_a_job_can_do_it_without_a_recorded_offer() -> None:
+    events = (event(0.0, "release", job="long-1"), *OUT, *done("long-1", 600, 900, 60.0))
+    log = replace(log_of(telemetry(1000), ("arm_a", "arm_b"), events), jobs=(record("long-1", 840.0),))
+    assert lateness_text(log, late_jobs(log)).endswith(": arm_a was out after a fault.")
+
+
 @pytest.mark.parametrize(
     ("done_s", "state", "able", "status", "stands"),
     [

@@ -16,7 +16,7 @@ from fleet.events import Event
 from scenarios.run.records import Halt, JobSpan, Notice, Offer, Outage, ShiftLog
 from scenarios.show.charts import AXIS, COLOURS, LAYOUT, Figure, named_rows, plain
 from scenarios.show.page import Badge, Chart, Head, Page, Playback, Section, packed
-from scenarios.show.timeline import STREAM_NAME, hottest_motors, shift_charts, stream_of, time_unit
+from scenarios.show.timeline import STREAM_NAME, hottest_motors, shift_charts, time_unit
 from scenarios.show.words import clock, duration, kind_text, names_text, offer_text, offers_text, value_text
 from scenarios.table import Column, Moment, Table, render
 
@@ -250,8 +250,8 @@ def standstill(log: ShiftLog) -> Standstill | None:
     ready_s = {job.job: log.ready_s(job) for job in log.jobs if job.state == "waiting"}
     jobs, since_s = set[str](), dict[str, float]()
     for job, job_s in ready_s.items():
-        offers = _offers_like(log, job)
-        for arm in _able(log, offers) if offers else log.arms:
+        able = log.able_arms(job)
+        for arm in log.arms if able is None else able:
             both_s = max(job_s, idle_s[arm])
             if end_s - both_s >= IDLE_S:
                 jobs.add(job)
@@ -362,7 +362,7 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
             return f"it waited for {last.job}, which finished at {clock(ready_s, log.begin)}"
         return f"it waits for {last.job}, which is not finished ({last.state.replace('_', ' ')})"
     begin_s = max(begin_s, ready_s)
-    able = _able(log, _offers_like(log, late.job))
+    able = log.able_arms(late.job)
     if not able:
         return "it was never awarded, and no offer for it or for a job with the same work is recorded"
     halts = {_halt(log, halt): halt for halt in log.halts if halt.start_s < late.due_s}
@@ -379,23 +379,6 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
         return most
     be = "" if most == PAUSED else "were " if len(arms) > 1 else "was "
     return f"{names_text(arms)} {be}{most}"
-
-
-def _able(log: ShiftLog, offers: Sequence[Offer]) -> list[str]:
-    """Arms that can do the job of some offers."""
-    return [arm for arm in log.arms if any(offer.feasible and offer.arm == arm for offer in offers)]
-
-
-def _offers_like(log: ShiftLog, job: str) -> list[Offer]:
-    """Offers for a job, else for jobs of its stream, else for jobs with the same work."""
-    offers = [offer for offer in log.offers if offer.job == job]
-    offers = offers or [offer for offer in log.offers if stream_of(offer.job) == stream_of(job)]
-    if not offers and (stream := log.stream(job)):
-        names = ("kind", "places", "payload_kg", "dwell_s", "force_n")
-        streams = log.streams.values()
-        alike = {each["name"] for each in streams if all(each.get(name) == stream.get(name) for name in names)}
-        offers = [offer for offer in log.offers if {offer.job, stream_of(offer.job)} & alike]
-    return offers
 
 
 def _absence_in(span: JobSpan, event: Event) -> bool:
@@ -424,8 +407,8 @@ def _passed(log: ShiftLog, late: LateJob, able: Sequence[str], begin_s: float, e
     took_s = {(o.arm, o.job, o.time_s): o.duration_s for o in log.offers if o.duration_s}
     like = [s for (_, job, _), s in took_s.items() if job == late.job]
     own = records.get(late.job)
-    if own is not None and not like:  # never awarded: by the time per cycle of jobs of its stream
-        alike = [(s, records[job]) for (_, job, _), s in took_s.items() if stream_of(job) == stream_of(late.job)]
+    if own is not None and not like and (work := log.work(late.job)):  # by the time per cycle of the same work
+        alike = [(s, records[job]) for (_, job, _), s in took_s.items() if job in records and log.work(job) == work]
         like = [s / record.cycles * own.cycles for s, record in alike if record.cycles]
     own_s = median(like) if like else 0.0
     counts = dict.fromkeys(("shorter", "worth more", "due earlier", "worth more per minute"), 0)
