@@ -515,7 +515,7 @@ def test_late_jobs_turn_the_badge_red_and_abandoned_ones_come_last() -> None:
         event(0.0, "release", job="open-1"), event(1000.0, "warning", job="")))  # fmt: skip
     assert lateness_text(unread, late_jobs(unread)[:1]).endswith("what arm_a did meanwhile is not recorded.")
     told = verdict(log)
-    assert (told.badge, told.good) == ("3 late jobs, 1 job left waiting beside idle arms", False)
+    assert (told.badge, told.good) == ("3 late jobs, 1 job left waiting", False)
     assert [late.job for late in late_jobs(log)] == ["open-1", "long-1", "gone-1"]
     assert told.moments[told.sentences[-1]].time_s == 500.0
     assert lateness_text(log, late_jobs(log)[1:2]) == (
@@ -626,6 +626,22 @@ def test_a_fleet_at_a_standstill_is_told(done_s: float, state: str, able: bool, 
     assert (sentence in told.sentences) == stands
     assert ("1 job left waiting beside idle arms" in told.badge) == stands
     assert told.good == (status == "finished" and not stands)
+
+
+def test_jobs_that_no_record_gives_an_arm_are_no_jobs_beside_idle_arms() -> None:
+    log = replace(
+        log_of(telemetry(1000), ("arm_a", "arm_b"), (), {"status": "finished"}),
+        jobs=(record("open-1", 5000.0, "waiting"), record("open-2", 5000.0, "waiting")),
+    )
+    told = verdict(log)
+    unknown = "still waited at the end, after at least 15 min; which arms can do"
+    assert (told.badge, told.good) == ("2 jobs left waiting", False)
+    assert f"2 jobs {unknown} them is not recorded." in told.sentences
+    partly = verdict(replace(log, offers=(offered("open-1", 50.0, 9.0),)))
+    assert (partly.badge, partly.good) == ("1 job left waiting beside idle arms, 1 more left waiting", False)
+    (sentence,) = [each for each in partly.sentences if unknown in each]
+    assert sentence.startswith("1 job still waited at the end, though arm_a was idle from 0:00:00 to the end:")
+    assert sentence.endswith(f"Besides, 1 job {unknown} it is not recorded.")
 
 
 def test_a_job_that_was_due_before_its_release_and_never_taken_has_no_time_of_work() -> None:

@@ -87,7 +87,7 @@ def verdict(log: ShiftLog) -> Verdict:
         counts = ((len(faults), "fault"), (contacts, "contact"), (len(late), "late job"))
         badge = ", ".join(f"{count} {what}{'s' * (count > 1)}" for count, what in counts if count)
         calm = "No fault, no job" if metrics.get("jobs") == 0 else "No fault, no late job"
-        waited = [f"{stood.count} left waiting beside idle arms"] if stood else []
+        waited = [stood.badge] if stood else []
         badge = ", ".join([*filter(None, [badge]), *waited])
         badge = badge or (calm if status == "finished" else f"Status: {status}")
     badge = f"{badge}; {log.unknown}" if log.unknown else badge
@@ -224,18 +224,27 @@ def _occupied(offer: Offer, log: ShiftLog) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Standstill:
-    """Jobs that waited at the end of a shift beside arms that had long been idle."""
+    """Jobs that waited at the end of a shift while arms had long been idle."""
 
     jobs: tuple[str, ...]
-    """Those that waited for no other job."""
+    """Those that waited for no other job, and that one of the arms can do by the record."""
     arms: tuple[str, ...]
     since_s: float
-    """From then on all of these arms were idle, and each could do one of the jobs, as far as is recorded."""
+    """From then on all of these arms were idle, and each could do one of the jobs; NaN without arms."""
+    unknown: tuple[str, ...] = ()
+    """Jobs that waited as long, of which no record states which arms can do them."""
 
     @property
-    def count(self) -> str:
-        """Number of the jobs, in words."""
-        return f"{len(self.jobs)} job{'s' * (len(self.jobs) > 1)}"
+    def badge(self) -> str:
+        """What was left, in a few words."""
+        if not self.jobs:
+            return f"{_count_jobs(self.unknown)} left waiting"
+        others = f", {len(self.unknown)} more left waiting" if self.unknown else ""
+        return f"{_count_jobs(self.jobs)} left waiting beside idle arms{others}"
+
+
+def _count_jobs(jobs: Sequence[str]) -> str:
+    return f"{len(jobs)} job{'s' * (len(jobs) > 1)}"
 
 
 def standstill(log: ShiftLog) -> Standstill | None:
@@ -248,27 +257,41 @@ def standstill(log: ShiftLog) -> Standstill | None:
     for halt in log.halts:
         idle_s |= {arm: max(idle_s[arm], halt.end_s) for arm in log.arms if halt.arm in ("", arm)}
     ready_s = {job.job: log.ready_s(job) for job in log.jobs if job.state == "waiting"}
-    jobs, since_s = set[str](), dict[str, float]()
+    jobs, unknown, since_s = set[str](), set[str](), dict[str, float]()
     for job, job_s in ready_s.items():
         able = log.able_arms(job)
         for arm in log.arms if able is None else able:
             both_s = max(job_s, idle_s[arm])
-            if end_s - both_s >= IDLE_S:
+            waited = end_s - both_s >= IDLE_S  # not if its release is unknown
+            if waited and able is None:
+                unknown.add(job)
+            elif waited:
                 jobs.add(job)
                 since_s[arm] = min(both_s, since_s.get(arm, math.inf))
-    if not jobs:
+    if not jobs and not unknown:
         return None
-    arms = tuple(arm for arm in log.arms if arm in since_s)
-    return Standstill(jobs=tuple(sorted(jobs)), arms=arms, since_s=max(since_s.values()))
+    return Standstill(
+        jobs=tuple(sorted(jobs)),
+        arms=tuple(arm for arm in log.arms if arm in since_s),
+        since_s=max(since_s.values(), default=math.nan),
+        unknown=tuple(sorted(unknown)),
+    )
 
 
 def standstill_text(log: ShiftLog, stood: Standstill) -> str:
     """How many jobs waited beside which arms since when, and what to look at."""
+    waited = (
+        f"{_count_jobs(stood.unknown)} still waited at the end, after at least {duration(IDLE_S)}; which arms can do "
+        f"{'them' if len(stood.unknown) > 1 else 'it'} is not recorded."
+    )
+    if not stood.jobs:
+        return waited
     be = "were" if len(stood.arms) > 1 else "was"
-    return (
-        f"{stood.count} still waited at the end, though {names_text(stood.arms)} {be} idle from "
+    beside = (
+        f"{_count_jobs(stood.jobs)} still waited at the end, though {names_text(stood.arms)} {be} idle from "
         f"{clock(stood.since_s, log.begin)} to the end: see why jobs are late in the report, and run another policy."
     )
+    return f"{beside} Besides, {waited}" if stood.unknown else beside
 
 
 @dataclass(frozen=True, kw_only=True)
