@@ -505,6 +505,25 @@ def test_the_reason_of_a_late_job_names_only_the_arms_that_it_holds_for() -> Non
     assert lateness_text(out, late_jobs(out)).endswith(": arm_a and arm_b were out after a fault.")
 
 
+def test_pauses_of_all_arms_that_can_do_a_late_job_count_together() -> None:
+    """Each pause is shorter than the idle time of both arms; an arm that cannot do the job is left out."""
+    readings, arms = telemetry(1000, 3), ("arm_a", "arm_b", "arm_c")
+    able = [replace(offered("long-1", 600.0, 300.0), arm=arm, feasible=arm != "arm_c") for arm in arms]
+    halts = [Halt(arm=arm, start_s=0.0, end_s=350.0, reason=f"{arm} was paused by ann") for arm in arms]
+    log = replace(
+        log_of(
+            replace(readings, temp_c=np.full(readings.temp_c.shape, 30.0)),
+            arms,
+            (event(0.0, "release", job="long-1"), *done("long-1", 600, 900, 60.0)),
+        ),
+        jobs=(record("long-1", 840.0),),
+        offers=tuple(able),
+        halts=tuple(halts),
+    )
+    paused = "arm_a was paused by ann from 0:00:00 to 0:05:50 and arm_b was paused by ann from 0:00:00 to 0:05:50"
+    assert lateness_text(log, late_jobs(log)) == f"long-1 finished 1 min late: {paused}."
+
+
 def test_late_jobs_turn_the_badge_red_and_abandoned_ones_come_last() -> None:
     events = (event(0.0, "release", job="long-1"), *done("long-1", 0, 900, 60.0))
     log = replace(

@@ -393,13 +393,15 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
     if all(each.start_s >= late.due_s for each in log.plan.breaks):
         waits_s.pop(PAUSED)  # it was late before
     most = max(waits_s, key=lambda why: sum(waits_s[why].values()))
+    longest = {arm: max(halts, key=lambda why: waits_s[why][arm]) for arm in able} if halts else {}
+    halted_s = {arm: waits_s[why][arm] for arm, why in longest.items()}
+    if 0 < sum(halted_s.values()) >= sum(waits_s[most].values()):
+        return names_text(list(dict.fromkeys(longest[arm] for arm in able if halted_s[arm] > 0)))
     arms = [arm for arm, time_s in waits_s[most].items() if time_s > 0]
     if not arms:
         return f"what {names_text(able)} did meanwhile is not recorded"
     if not most:
         return _passed(log, late, able, begin_s, end_s)
-    if most in halts:
-        return most
     be = "" if most == PAUSED else "were " if len(arms) > 1 else "was "
     return f"{names_text(arms)} {be}{most}"
 
