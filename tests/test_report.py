@@ -506,6 +506,25 @@ def test_the_reason_of_a_late_job_names_only_the_arms_that_it_holds_for() -> Non
     assert lateness_text(out, late_jobs(out)).endswith(": arm_a and arm_b were out after a fault.")
 
 
+def test_pauses_of_all_arms_that_can_do_a_late_job_count_together() -> None:
+    """Each pause is shorter than the idle time of both arms; an arm that cannot do the job is left out."""
+    readings, arms = telemetry(1000, 3), ("arm_a", "arm_b", "arm_c")
+    able = [replace(offered("long-1", 600.0, 300.0), arm=arm, feasible=arm != "arm_c") for arm in arms]
+    halts = [Halt(arm=arm, start_s=0.0, end_s=350.0, reason=f"{arm} was paused by ann") for arm in arms]
+    log = replace(
+        log_of(
+            replace(readings, temp_c=np.full(readings.temp_c.shape, 30.0)),
+            arms,
+            (event(0.0, "release", job="long-1"), *done("long-1", 600, 900, 60.0)),
+        ),
+        jobs=(record("long-1", 840.0),),
+        offers=tuple(able),
+        halts=tuple(halts),
+    )
+    paused = "arm_a was paused by ann from 0:00:00 to 0:05:50 and arm_b was paused by ann from 0:00:00 to 0:05:50"
+    assert lateness_text(log, late_jobs(log)) == f"long-1 finished 1 min late: {paused}."
+
+
 def test_late_jobs_turn_the_badge_red_and_abandoned_ones_come_last() -> None:
     events = (event(0.0, "release", job="long-1"), *done("long-1", 0, 900, 60.0))
     log = replace(
@@ -516,7 +535,7 @@ def test_late_jobs_turn_the_badge_red_and_abandoned_ones_come_last() -> None:
         event(0.0, "release", job="open-1"), event(1000.0, "warning", job="")))  # fmt: skip
     assert lateness_text(unread, late_jobs(unread)[:1]).endswith("what arm_a did meanwhile is not recorded.")
     told = verdict(log)
-    assert (told.badge, told.good) == ("3 late jobs, 1 job left waiting beside idle arms", False)
+    assert (told.badge, told.good) == ("3 late jobs, 1 job left waiting", False)
     assert [late.job for late in late_jobs(log)] == ["open-1", "long-1", "gone-1"]
     assert told.moments[told.sentences[-1]].time_s == 500.0
     assert lateness_text(log, late_jobs(log)[1:2]) == (
@@ -557,6 +576,47 @@ def test_a_row_of_a_table_that_was_never_awarded_has_a_reason(card, finished_s: 
     )
     (late,) = late_jobs(log)
     assert lateness_text(log, [late]) == f"A2 is unfinished 8 min 20 s after its due date: {reason}."
+
+
+HOLDS = {"name": "hold", "kind": "hold", "places": ["a"], "payload_kg": [0.5, 2.5]}
+NOT_RECORDED = "it was never awarded, and no offer for it or for a job with the same work is recorded"
+PLACE_TAKEN = "arm_a was idle: the job's place was taken, or the policy let the job wait"
+
+
+@pytest.mark.parametrize(
+    ("streams", "payload_kg", "reason"),
+    [
+        ([], 2.5, NOT_RECORDED),
+        ([HOLDS], 2.5, PLACE_TAKEN),
+        ([HOLDS], 0.5, NOT_RECORDED),
+        ([HOLDS | {"name": "hold-250"}, HOLDS | {"name": "hold-251"}], 2.5, PLACE_TAKEN),
+        ([HOLDS | {"name": "hold-250"}, HOLDS | {"name": "hold-251", "places": ["b"]}], 2.5, NOT_RECORDED),
+    ],
+    ids=["submitted jobs", "a stream", "another payload", "rows alike", "another place"],
+)
+def test_offers_for_another_job_count_only_if_its_recorded_work_is_the_same(
+    streams: list[dict[str, Any]], payload_kg: float, reason: str
+) -> None:
+    readings = telemetry(1000)
+    log = replace(
+        log_of(
+            replace(readings, temp_c=np.full(readings.temp_c.shape, 30.0)),
+            ("arm_a", "arm_b"),
+            card={"scenario": {"jobs": streams}},
+        ),
+        jobs=(
+            replace(record("hold-250", 500.0, "waiting"), payload_kg=2.5),
+            replace(record("hold-251", 900.0), payload_kg=payload_kg),
+        ),
+        offers=(offered("hold-251", 10.0, 100.0),),
+    )
+    assert lateness_text(log, late_jobs(log)).endswith(f": {reason}.")
+
+
+def test_an_arm_that_was_awarded_a_job_can_do_it_without_a_recorded_offer() -> None:
+    events = (event(0.0, "release", job="long-1"), *OUT, *done("long-1", 600, 900, 60.0))
+    log = replace(log_of(telemetry(1000), ("arm_a", "arm_b"), events), jobs=(record("long-1", 840.0),))
+    assert lateness_text(log, late_jobs(log)).endswith(": arm_a was out after a fault.")
 
 
 @pytest.mark.parametrize(
@@ -600,6 +660,22 @@ def test_an_arm_without_recorded_states_at_the_end_is_not_idle_beside_waiting_jo
     readings.temp_c[500:, 0] = np.nan
     log = log_of(readings, ("arm_a",), (), {"status": "finished"})
     assert standstill(replace(log, jobs=(record("open-1", 5000.0, "waiting"),))) is None
+
+
+def test_jobs_that_no_record_gives_an_arm_are_no_jobs_beside_idle_arms() -> None:
+    log = replace(
+        log_of(telemetry(1000), ("arm_a", "arm_b"), (), {"status": "finished"}),
+        jobs=(record("open-1", 5000.0, "waiting"), record("open-2", 5000.0, "waiting")),
+    )
+    told = verdict(log)
+    unknown = "still waited at the end, after at least 15 min; which arms can do"
+    assert (told.badge, told.good) == ("2 jobs left waiting", False)
+    assert f"2 jobs {unknown} them is not recorded." in told.sentences
+    partly = verdict(replace(log, offers=(offered("open-1", 50.0, 9.0),)))
+    assert (partly.badge, partly.good) == ("1 job left waiting beside idle arms, 1 more left waiting", False)
+    (sentence,) = [each for each in partly.sentences if unknown in each]
+    assert sentence.startswith("1 job still waited at the end, though arm_a was idle from 0:00:00 to the end:")
+    assert sentence.endswith(f"Besides, 1 job {unknown} it is not recorded.")
 
 
 def test_a_job_that_was_due_before_its_release_and_never_taken_has_no_time_of_work() -> None:

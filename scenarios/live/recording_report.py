@@ -107,7 +107,8 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
         "status": "running" if card.status == "recording" else card.status,
         "scenario": {"name": card.fleet},
         "policy": "live recording",
-        "metrics": _metrics(telemetry, events, jobs, arms, limits.warning_c) | heat_use(table, arms),
+        "metrics": _metrics(telemetry, events, jobs, arms, limits.warning_c, states_published=results.num_rows > 0)
+        | heat_use(table, arms),
         "messages": {
             sender: f"{count.kept} recorded, {count.missed} missing" for sender, count in sorted(card.senders.items())
         },
@@ -500,9 +501,19 @@ def offers_of(row: Mapping[str, Any]) -> Iterator[Offer]:
 
 
 def _metrics(
-    telemetry: Telemetry, events: Sequence[Event], jobs: Sequence[JobRecord], arms: Sequence[str], warning_c: float
+    telemetry: Telemetry,
+    events: Sequence[Event],
+    jobs: Sequence[JobRecord],
+    arms: Sequence[str],
+    warning_c: float,
+    *,
+    states_published: bool,
 ) -> dict[str, Any]:
-    """Key figures, named as in a run; what only the simulator knows is left out."""
+    """Key figures, named as in a run; what only the simulator knows is left out.
+
+    Args:
+        states_published: Whether an auctioneer published the states of jobs; without them, counts of states are None.
+    """
     late_by_job = {job.job: job.finished_s - job.due_s for job in jobs if job.finished_s is not None}
     late_by_job |= {event.job: event.value for event in events if event.kind == "finish"}
     late_s = [each if math.isnan(each) else max(0.0, each) for each in late_by_job.values()]
@@ -520,9 +531,7 @@ def _metrics(
         "on_time": sum(not late for late in late_s),
         "tardiness_min": float(np.nansum(late_s)) / 60.0,
         "faults": sum(event.kind == "fault" for event in events),
-        "given_up": states["given_up"],
-        "expired": states["expired"],
-        "unfinished": states["unfinished"],
+        **{state: states[state] if states_published else None for state in ("given_up", "expired", "unfinished")},
         "above_warning_min": float(hot.sum()) * step_s / 60.0,
         "availability": float(1.0 - (telemetry.mode[seen] == FAULTED).mean()) if seen.any() else None,
         "utilisation": float((telemetry.mode[seen] == WORKING).mean()) if seen.any() else None,

@@ -371,6 +371,51 @@ class ShiftLog:
         """The stream of a job; empty if it is not recorded."""
         return self.streams.get(job) or self.streams.get(job.rpartition("-")[0]) or {}
 
+    def work(self, job: str) -> tuple[Any, ...] | None:
+        """What an arm does in a cycle of a job: kind, places, payload, duration and force; None if it is not recorded.
+
+        A common start of two names is no evidence: rows of a job table and submitted jobs may have any name.
+        """
+        stream, record = self.stream(job), self.records.get(job)
+        if not stream or record is None:
+            return None
+        cycle = (stream.get(name) for name in ("kind", "places", "dwell_s", "force_n"))
+        return *cycle, record.payload_kg
+
+    @cached_property
+    def _arms_by_job(self) -> Mapping[str, frozenset[str]]:
+        """Of each job with an offer or an award the arms that can do it."""
+        able = {offer.job: set[str]() for offer in self.offers}
+        for offer in self.offers:
+            able[offer.job] |= {offer.arm} if offer.feasible else set()
+        for span in self.plan.assignments:
+            able.setdefault(span.job, set()).add(span.arm)
+        return {job: frozenset(arms) for job, arms in able.items()}
+
+    @cached_property
+    def _arms_by_work(self) -> Sequence[tuple[tuple[Any, ...], set[str]]]:
+        """Of each recorded work the arms that can do a job with it."""
+        able = list[tuple[tuple[Any, ...], set[str]]]()
+        for job, arms in self._arms_by_job.items():
+            if (work := self.work(job)) is None:
+                continue
+            known = next((each for other, each in able if other == work), None)
+            if known is None:
+                able.append((work, set(arms)))
+            else:
+                known |= arms
+        return able
+
+    def able_arms(self, job: str) -> list[str] | None:
+        """Arms that can do a job, by its own offers and awards, else by those of jobs with the same recorded work.
+
+        None if nothing of that is recorded.
+        """
+        able = self._arms_by_job.get(job)
+        if able is None and (work := self.work(job)) is not None:
+            able = next((arms for other, arms in self._arms_by_work if other == work), None)
+        return None if able is None else [arm for arm in self.arms if arm in able]
+
     @cached_property
     def last_before(self) -> Mapping[str, tuple[JobRecord, float]]:
         """Of each job that waits for others the one that finishes last, and its finish, s: infinite if unfinished."""

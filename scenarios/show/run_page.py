@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from statistics import median
@@ -16,7 +16,7 @@ from fleet.events import Event
 from scenarios.run.records import Halt, JobSpan, Notice, Offer, Outage, ShiftLog
 from scenarios.show.charts import AXIS, COLOURS, LAYOUT, Figure, named_rows, plain
 from scenarios.show.page import Badge, Chart, Head, Page, Playback, Section, packed
-from scenarios.show.timeline import STREAM_NAME, hottest_motors, shift_charts, stream_of, time_unit
+from scenarios.show.timeline import STREAM_NAME, hottest_motors, shift_charts, time_unit
 from scenarios.show.words import clock, duration, kind_text, names_text, offer_text, offers_text, value_text
 from scenarios.table import Column, Moment, Table, render
 
@@ -87,7 +87,7 @@ def verdict(log: ShiftLog) -> Verdict:
         counts = ((len(faults), "fault"), (contacts, "contact"), (len(late), "late job"))
         badge = ", ".join(f"{count} {what}{'s' * (count > 1)}" for count, what in counts if count)
         calm = "No fault, no job" if metrics.get("jobs") == 0 else "No fault, no late job"
-        waited = [f"{stood.count} left waiting beside idle arms"] if stood else []
+        waited = [stood.badge] if stood else []
         badge = ", ".join([*filter(None, [badge]), *waited])
         badge = badge or (calm if status == "finished" else f"Status: {status}")
     badge = f"{badge}; {log.unknown}" if log.unknown else badge
@@ -224,18 +224,27 @@ def _occupied(offer: Offer, log: ShiftLog) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Standstill:
-    """Jobs that waited at the end of a shift beside arms that had long been idle."""
+    """Jobs that waited at the end of a shift while arms had long been idle."""
 
     jobs: tuple[str, ...]
-    """Those that waited for no other job."""
+    """Those that waited for no other job, and that one of the arms can do by the record."""
     arms: tuple[str, ...]
     since_s: float
-    """From then on all of these arms were idle, and each could do one of the jobs, as far as is recorded."""
+    """From then on all of these arms were idle, and each could do one of the jobs; NaN without arms."""
+    unknown: tuple[str, ...] = ()
+    """Jobs that waited as long, of which no record states which arms can do them."""
 
     @property
-    def count(self) -> str:
-        """Number of the jobs, in words."""
-        return f"{len(self.jobs)} job{'s' * (len(self.jobs) > 1)}"
+    def badge(self) -> str:
+        """What was left, in a few words."""
+        if not self.jobs:
+            return f"{_count_jobs(self.unknown)} left waiting"
+        others = f", {len(self.unknown)} more left waiting" if self.unknown else ""
+        return f"{_count_jobs(self.jobs)} left waiting beside idle arms{others}"
+
+
+def _count_jobs(jobs: Sequence[str]) -> str:
+    return f"{len(jobs)} job{'s' * (len(jobs) > 1)}"
 
 
 def standstill(log: ShiftLog) -> Standstill | None:
@@ -251,27 +260,41 @@ def standstill(log: ShiftLog) -> Standstill | None:
     for a, arm in enumerate(log.arms):
         idle_s[arm] = max(idle_s[arm], float(log.readings.time_s[absent[:, a]].max(initial=0.0)))
     ready_s = {job.job: log.ready_s(job) for job in log.jobs if job.state == "waiting"}
-    able, jobs, since_s = _able_arms(log), set[str](), dict[str, float]()
+    jobs, unknown, since_s = set[str](), set[str](), dict[str, float]()
     for job, job_s in ready_s.items():
-        candidates = _able(log, able, job)
-        for arm in log.arms if candidates is None else candidates:
+        able = log.able_arms(job)
+        for arm in log.arms if able is None else able:
             both_s = max(job_s, idle_s[arm])
-            if end_s - both_s >= IDLE_S:
+            waited = end_s - both_s >= IDLE_S  # not if its release is unknown
+            if waited and able is None:
+                unknown.add(job)
+            elif waited:
                 jobs.add(job)
                 since_s[arm] = min(both_s, since_s.get(arm, math.inf))
-    if not jobs:
+    if not jobs and not unknown:
         return None
-    arms = tuple(arm for arm in log.arms if arm in since_s)
-    return Standstill(jobs=tuple(sorted(jobs)), arms=arms, since_s=max(since_s.values()))
+    return Standstill(
+        jobs=tuple(sorted(jobs)),
+        arms=tuple(arm for arm in log.arms if arm in since_s),
+        since_s=max(since_s.values(), default=math.nan),
+        unknown=tuple(sorted(unknown)),
+    )
 
 
 def standstill_text(log: ShiftLog, stood: Standstill) -> str:
     """How many jobs waited beside which arms since when, and what to look at."""
+    waited = (
+        f"{_count_jobs(stood.unknown)} still waited at the end, after at least {duration(IDLE_S)}; which arms can do "
+        f"{'them' if len(stood.unknown) > 1 else 'it'} is not recorded."
+    )
+    if not stood.jobs:
+        return waited
     be = "were" if len(stood.arms) > 1 else "was"
-    return (
-        f"{stood.count} still waited at the end, though {names_text(stood.arms)} {be} idle from "
+    beside = (
+        f"{_count_jobs(stood.jobs)} still waited at the end, though {names_text(stood.arms)} {be} idle from "
         f"{clock(stood.since_s, log.begin)} to the end: see why jobs are late in the report, and run another policy."
     )
+    return f"{beside} Besides, {waited}" if stood.unknown else beside
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -365,7 +388,7 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
             return f"it waited for {last.job}, which finished at {clock(ready_s, log.begin)}"
         return f"it waits for {last.job}, which is not finished ({last.state.replace('_', ' ')})"
     begin_s = max(begin_s, ready_s)
-    able = _able(log, _able_arms(log), late.job)
+    able = log.able_arms(late.job)
     if not able:
         return "it was never awarded, and no offer for it or for a job with the same work is recorded"
     halts = {_halt(log, halt): halt for halt in log.halts if halt.start_s < late.due_s}
@@ -373,42 +396,17 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
     if all(each.start_s >= late.due_s for each in log.plan.breaks):
         waits_s.pop(PAUSED)  # it was late before
     most = max(waits_s, key=lambda why: sum(waits_s[why].values()))
+    longest = {arm: max(halts, key=lambda why: waits_s[why][arm]) for arm in able} if halts else {}
+    halted_s = {arm: waits_s[why][arm] for arm, why in longest.items()}
+    if 0 < sum(halted_s.values()) >= sum(waits_s[most].values()):
+        return names_text(list(dict.fromkeys(longest[arm] for arm in able if halted_s[arm] > 0)))
     arms = [arm for arm, time_s in waits_s[most].items() if time_s > 0]
     if not arms:
         return f"what {names_text(able)} did meanwhile is not recorded"
     if not most:
         return _passed(log, late, able, begin_s, end_s)
-    if most in halts:
-        return most
     be = "" if most == PAUSED else "were " if len(arms) > 1 else "was "
     return f"{names_text(arms)} {be}{most}"
-
-
-Likeness = tuple[str, str]
-"""What two jobs have in common, and its value."""
-
-
-def _likenesses(log: ShiftLog, job: str) -> tuple[Likeness, ...]:
-    """Name, stream and work of a job: what offers for jobs like it have, the closest first."""
-    stream = log.stream(job)
-    work = repr([stream.get(name) for name in ("kind", "places", "payload_kg", "dwell_s", "force_n")])
-    return (("job", job), ("stream", stream_of(job)), *((("work", work),) if stream else ()))
-
-
-def _able_arms(log: ShiftLog) -> dict[Likeness, set[str]]:
-    """Arms that can do the jobs of the recorded offers, by what like jobs have in common."""
-    able = dict[Likeness, set[str]]()
-    likenesses = {job: _likenesses(log, job) for job in {offer.job for offer in log.offers}}
-    for offer in log.offers:
-        for likeness in likenesses[offer.job]:
-            able.setdefault(likeness, set()).update((offer.arm,) if offer.feasible else ())
-    return able
-
-
-def _able(log: ShiftLog, able: Mapping[Likeness, Collection[str]], job: str) -> list[str] | None:
-    """Arms that can do a job, by the offers for the job or those most like it; None without such an offer."""
-    likeness = next((each for each in _likenesses(log, job) if each in able), None)
-    return None if likeness is None else [arm for arm in log.arms if arm in able[likeness]]
 
 
 def _absence_in(span: JobSpan, event: Event) -> bool:
@@ -437,8 +435,8 @@ def _passed(log: ShiftLog, late: LateJob, able: Sequence[str], begin_s: float, e
     took_s = {(o.arm, o.job, o.time_s): o.duration_s for o in log.offers if o.duration_s}
     like = [s for (_, job, _), s in took_s.items() if job == late.job]
     own = records.get(late.job)
-    if own is not None and not like:  # never awarded: by the time per cycle of jobs of its stream
-        alike = [(s, records[job]) for (_, job, _), s in took_s.items() if stream_of(job) == stream_of(late.job)]
+    if own is not None and not like and (work := log.work(late.job)):  # by the time per cycle of the same work
+        alike = [(s, records[job]) for (_, job, _), s in took_s.items() if job in records and log.work(job) == work]
         like = [s / record.cycles * own.cycles for s, record in alike if record.cycles]
     own_s = median(like) if like else 0.0
     counts = dict.fromkeys(("shorter", "worth more", "due earlier", "worth more per minute"), 0)
@@ -764,13 +762,14 @@ def _counted(counts: Mapping[str, int]) -> str:
 
 
 def _provenance(run: Mapping[str, Any]) -> Table:
-    """Everything else in `run.json`."""
+    """Everything else in `run.json`; the cell of an unknown value is empty."""
     rows = list[tuple[str, str]]()
     scenario = {f"scenario {k}": v for k, v in run.get("scenario", {}).items() if k not in ("name", "description")}
     rest = {k: v for k, v in run.items() if k not in ("scenario", "status", "policy", "seed")}
     for key, value in (rest | scenario).items():
         parts = value.items() if isinstance(value, Mapping) else [("", value)]
-        rows += [(f"{key} {part}".strip(), value_text(inner)) for part, inner in parts]
+        texts = [(part, "" if inner is None else value_text(inner)) for part, inner in parts]
+        rows += [(f"{key} {part}".strip(), text) for part, text in texts]
     return Table(head=("", ""), rows=tuple(rows), numbers=False)
 
 

@@ -713,6 +713,20 @@ def test_without_an_auctioneer_a_report_does_not_promise_that_all_went_well(tmp_
     assert verdict(dataclasses.replace(log, card=card, unknown="")).badge == "No fault, no job"
 
 
+@pytest.mark.parametrize("central", [True, False])
+def test_jobs_that_were_given_up_are_counted_only_where_their_states_are_published(tmp_path, central):
+    recorder = record_events(tmp_path / "r", ())
+    if central:
+        recorder.add("boss", Result("boss", 0, 5.0, JobStatus("x", "given_up")))
+    recorder.write(status="finished")
+    log = open_recording(tmp_path / "r")
+    counts = {"given_up": 1, "expired": 0, "unfinished": 0}
+    html = log.page()
+    for state, count in counts.items():
+        assert log.card["metrics"][state] == (count if central else None)
+        assert f"<td>metrics {state}</td><td>{count if central else ''}</td>" in html
+
+
 def test_an_end_that_no_state_shows_is_at_the_next_award_and_its_reason_unknown(tmp_path):
     log = record_peers(tmp_path, [[""] * 100], NEXT_JOB)
     assert [(e.time_s, e.reason) for e in log.events if e.kind == "return"] == [(40.0, "the reason is not recorded")]
