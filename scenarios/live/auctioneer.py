@@ -20,6 +20,7 @@ from fleet.job import Job
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.rounds import Allocate, Assignment, Bidding, resolve_claims
+from fleet.live.job_rules import MAX_OPEN_JOBS
 from fleet.live.journal import Journal
 from fleet.live.leases import Timing
 from fleet.live.records import BookRecord
@@ -169,10 +170,16 @@ def submit_stream(
     node: AuctionNode, stream: Sequence[tuple[float, JobSpec]], horizon_s: float, stop: StopRequest
 ) -> None:
     """Serve, and submit a stream of jobs as they are released, until all are settled or the shift is over."""
-    left = [] if node.book.ended else list(stream)
+    left, full = [] if node.book.ended else list(stream), False
     while not stop.is_set():
         node.serve(time.monotonic() + TURN_S)
         due = tuple(job for at_s, job in left if at_s <= node.time_s)
+        room = max(0, MAX_OPEN_JOBS - len(node.book.unsettled())) if due else 0
+        if full != (len(due) > room):
+            full = not full
+            if full:
+                _LOG.warning("There are %d open jobs: the scenario's jobs wait until some are finished.", MAX_OPEN_JOBS)
+        due = due[:room]
         if due and not node.rivals:
             try:
                 for admission in node.submit(Submission(due, "scenario")).jobs:

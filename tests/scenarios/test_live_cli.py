@@ -290,6 +290,15 @@ def test_a_stream_is_submitted_as_released(monkeypatch, stage, horizon_s, submit
     assert (stage.submitted, stage.book.ended) == (submitted, ended)
 
 
+def test_jobs_of_a_stream_wait_for_room_among_the_open_jobs(monkeypatch):
+    monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
+    monkeypatch.setattr(live_auction, "MAX_OPEN_JOBS", 2)
+    stage = Stage()
+    stream = [(0.0, JobSpec(name, "hold", ("x",))) for name in "abcde"]
+    live_auction.submit_stream(stage, stream, 1e6, SimpleNamespace(is_set=lambda: False))
+    assert stage.submitted == [(3600.0, ["a", "b"]), (7200.0, ["c", "d"]), (10800.0, ["e"])]
+
+
 def test_a_job_message_has_all_fields():
     place = Place(name="rack", position_m=(0.0, 0.0, 0.0))
     work = Work(kind="press", places=(place,), force_n=30.0, dwell_s=20.0)
