@@ -36,7 +36,7 @@ ROUNDING = 1e-9
 MOST_PASSES = 12
 """Decisions in which a job keeps a slot that others wait for, while an arm is idle and does not take it."""
 FOR_PASSED = 4
-"""Of so many slots one is for jobs that were passed over, even if others wait."""
+"""One in this number of slots is kept for jobs that were passed over, even if others wait."""
 LARGEST = float(np.finfo(np.float32).max)
 """Claims without a difficulty are ordered behind all others."""
 

@@ -62,9 +62,10 @@ def keys_command(
         make(folder, roster, days=days, hosts=hosts, overwrite=overwrite)
     before = tuple[RosterEntry, ...]()
     if added:
-        before = read_roster(folder).participants
+        known = read_roster(folder)
+        before = known.participants
         others = tuple(one for one in before if one not in added)
-        lifetimes(folder, Roster(read_roster(folder).fleet, others))  # refuses what could not be shown afterwards
+        lifetimes(folder, Roster(known.fleet, others))  # refuses what could not be shown afterwards
         add_to(folder, added, days=days, hosts=hosts, overwrite=overwrite)
     roster = read_roster(folder)
     spans = lifetimes(folder, roster)

@@ -100,10 +100,7 @@ def doubts_of(network: "Identified") -> list[str]:
     doubts += unlike.doubts
     if worst_k > MOST_RESIDUAL_K:
         doubts.append(f"a residual of {worst_k:.1f} K, where public logs have up to 0.3 K")
-    if not doubts:
-        return []
-    ask = "Check the units and the order of temperatures, currents and torques, and the ambient temperature."
-    return [" ".join(filter(None, (f"Do not trust this network: {', and '.join(doubts)}.", unlike.question, ask)))]
+    return [f"Do not trust this network: {', and '.join(doubts)}. {unlike.remedy}"] if doubts else []
 
 
 def parameter_table(network: "Identified") -> Table:

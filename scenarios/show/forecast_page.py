@@ -68,9 +68,7 @@ def _doubts(found: ThermalForecast, repetitions: int) -> list[str]:
     elif found.unlike.doubts:
         reason = f"the load explains the temperatures only if {', and '.join(found.unlike.doubts)}"
     if reason:
-        ask = "Check the units and the order of temperatures, currents and torques, and the ambient temperature."
-        cause = f"{found.unlike.question} " if found.unlike.question else ""
-        doubts.append(f"Do not trust this forecast: in the log, {reason}. {cause}{ask}")
+        doubts.append(f"Do not trust this forecast: in the log, {reason}. {found.unlike.remedy}")
     if repetitions > 1 and found.way_back_rad > MOST_WAY_RAD:
         doubts.append(
             f"The plan ends {found.way_back_rad:.2f} rad from where it begins. The way back, between the repetitions, "

@@ -491,6 +491,12 @@ class Unlike:
     question: str = ""
     """Probable cause, as a sentence; empty if it is unknown."""
 
+    @property
+    def remedy(self) -> str:
+        """What to check where the network or the log is in doubt, the probable cause first."""
+        check = "Check the units and the order of temperatures, currents and torques, and the ambient temperature."
+        return f"{self.question} {check}".strip()
+
     @classmethod
     def of(
         cls,
