@@ -7,7 +7,7 @@ import http.client
 import json
 import re
 from collections import Counter
-from contextlib import ExitStack
+from contextlib import ExitStack, asynccontextmanager
 from pathlib import Path
 
 import msgspec
@@ -251,14 +251,19 @@ def test_an_arm_is_absent_because_its_states_are_malformed_if_they_are(router, m
         assert what.startswith("b is absent: its states are malformed: ")
 
 
-async def receiver(replies, requests):
-    """A server that gives these statuses in turn, and puts what it received into a queue; None: it never replies."""
+@asynccontextmanager
+async def target(*replies, at="127.0.0.1", path=""):
+    """A webhook that runs, and the requests that its target receives, which replies with these statuses in turn.
+
+    After them it accepts everything; None: it never replies.
+    """
+    requests, left = asyncio.Queue(), [*replies]
 
     async def handle(reader, writer):
         head = (await reader.readuntil(b"\r\n\r\n")).decode()
         length = int(re.search(r"Content-Length: (\d+)", head)[1])
         requests.put_nowait((head, await reader.readexactly(length)))
-        status = replies.pop(0) if replies else 200
+        status = left.pop(0) if left else 200
         if status is None:
             await reader.read()  # until the sender gives up
         else:
@@ -266,7 +271,12 @@ async def receiver(replies, requests):
         writer.close()
         await writer.wait_closed()
 
-    return await asyncio.start_server(handle, "127.0.0.1", 0)
+    async with await asyncio.start_server(handle, "127.0.0.1", 0) as server, asyncio.timeout(PATIENCE_S):
+        hook = Webhook(f"http://{at}:{server.sockets[0].getsockname()[1]}{path}", SECRET)
+        task = asyncio.create_task(hook.run())
+        yield hook, requests
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
 
 
 def test_a_webhook_is_signed_and_repeated_until_it_is_accepted(monkeypatch):
@@ -275,16 +285,10 @@ def test_a_webhook_is_signed_and_repeated_until_it_is_accepted(monkeypatch):
     monkeypatch.setattr(webhooks, "REPLY_S", 1.0)
 
     async def run():
-        requests = asyncio.Queue()
-        async with await receiver([500, None, 204], requests) as server:
-            hook = Webhook(f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}/in?x=1", SECRET)
-            task = asyncio.create_task(hook.run())
+        async with target(500, None, 204, path="/in?x=1") as (hook, requests):
             hook.send(ALARM)
             hook.send(msgspec.structs.replace(ALARM, number=2))
-            async with asyncio.timeout(PATIENCE_S):
-                received = [await requests.get() for _ in range(4)]
-            task.cancel()
-            return received
+            return [await requests.get() for _ in range(4)]
 
     requests = asyncio.run(run())
     assert [json.loads(body)["number"] for _, body in requests] == [1, 1, 1, 2]
@@ -306,15 +310,10 @@ def test_an_alarm_waits_for_a_target_that_is_down_and_not_for_one_that_refuses_i
     monkeypatch.setattr(webhooks, "RETRY_S", (0.0, 0.0))
 
     async def run():
-        requests = asyncio.Queue()
-        async with await receiver(replies, requests) as server, asyncio.timeout(PATIENCE_S):
-            hook = Webhook(f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}", SECRET)
-            task = asyncio.create_task(hook.run())
+        async with target(*replies) as (hook, requests):
             hook.send(ALARM)
             hook.send(msgspec.structs.replace(ALARM, number=2))
-            received = [await requests.get() for _ in numbers]
-            task.cancel()
-            return received
+            return [await requests.get() for _ in numbers]
 
     assert [json.loads(body)["number"] for _, body in asyncio.run(run())] == numbers
 
@@ -324,44 +323,29 @@ def test_a_target_that_accepts_nothing_raises_an_alarm_until_it_accepts_one(monk
     monkeypatch.setattr(webhooks, "RETRY_S", (0.0, 0.0))
 
     async def run():
-        requests = asyncio.Queue()
-        async with await receiver([500, 200, 403, 403, 403, 200], requests) as server, asyncio.timeout(PATIENCE_S):
-            port = server.sockets[0].getsockname()[1]
-            hook = Webhook(f"http://127.0.0.1:{port}/secret", SECRET)
-            task = asyncio.create_task(hook.run())
-            hook.send(ALARM)
-            hook.send(ALARM)
+        async with target(500, 200, 403, 403, 403, 200, path="/secret") as (hook, requests):
             found = []
-            for _ in range(2):
-                await requests.get()
-            found.append(hook.findings())  # the first alarm failed once, and is accepted in its second attempt
-            for _ in range(3):  # the third attempt begins after the second has failed
-                await requests.get()
-            found.append(hook.findings())
-            hook.send(ALARM)
-            hook.send(ALARM)
-            for _ in range(2):  # the last alarm is sent after the one before was accepted
-                await requests.get()
-            found.append(hook.findings())
-            task.cancel()
-            return port, found
+            # The first alarm is accepted in its second attempt. The third attempt of the second begins after the second
+            # has failed. The last alarm is sent after the one before was accepted.
+            for alarms, count in ((2, 2), (0, 3), (2, 2)):
+                for _ in range(alarms):
+                    hook.send(ALARM)
+                for _ in range(count):
+                    await requests.get()
+                found.append([(each.kind, each.what) for each in hook.findings()])
+            return hook._target, found
 
-    port, found = asyncio.run(run())
-    what = f"The webhook at 127.0.0.1:{port} accepts no alarms: status 403."
-    assert [[(each.kind, each.what) for each in findings] for findings in found] == [[], [("webhook", what)], []]
+    at, found = asyncio.run(run())
+    assert found == [[], [("webhook", f"The webhook at {at} accepts no alarms: status 403.")], []]
+    assert re.fullmatch(r"127\.0\.0\.1:\d+", at)
 
 
 def test_a_target_that_never_replies_holds_a_bounded_number_of_alarms_and_nothing_else():
     async def run():
-        requests = asyncio.Queue()
-        async with await receiver([None] * 100, requests) as server:
-            hook = Webhook(f"http://localhost:{server.sockets[0].getsockname()[1]}", SECRET)
-            task = asyncio.create_task(hook.run())
+        async with target(*[None] * 100, at="localhost") as (hook, requests):
             for number in range(10 * MOST_WAITING):
                 hook.send(msgspec.structs.replace(ALARM, number=number))
-            await asyncio.wait_for(requests.get(), PATIENCE_S)
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
+            await requests.get()
             return len(hook._waiting)
 
     assert asyncio.run(run()) <= MOST_WAITING

@@ -35,7 +35,8 @@ BROWSER = {"Accept": "text/html,application/xhtml+xml,application/xml;q=0.9,*/*;
 CRATE_JSON = {"name": "crate 1", "kind": "hold", "places": ["rack"]}
 JSON = "application/json"
 PAUSE = {"request": "1", "action": {"action": "pause"}}
-LATE = {"action": "change", "job": "a", "due_s": -5}
+FLY, LATE = {"action": "fly"}, {"action": "change", "job": "a", "due_s": -5}
+SETTLE = {"action": "settle", "job": "a", "outcome": "so"}
 CSV = {"Content-Type": "text/csv; charset=utf-8"}
 WATCHER, SENDER, BOSS = "watcher-watcher-watcher", "sender-sender-sender", "operator-operator-operator"
 
@@ -231,104 +232,57 @@ def test_all_jobs_of_a_large_fleet_are_told_and_counted():
     assert sorted(job["job"] for job in told["jobs"]) == sorted(desk.entries)
 
 
-@pytest.mark.parametrize(
-    ("method", "path", "body", "headers", "status", "says"),
-    [
-        ("POST", "/v4/jobs", "{", {}, 422, "Not a thermofleet.Submission"),
-        ("POST", "/v4/jobs", {"jobs": []}, {}, 422, "length >= 1"),
-        ("POST", "/v4/jobs", {"jobs": [{**CRATE_JSON, "places": ["a", "b"]}]}, {}, 422, "place"),
-        ("POST", "/v4/jobs", b"\xff", {}, 422, "Not a"),
-        ("POST", "/v4/jobs", {"jobs": [CRATE_JSON]}, {"Content-Type": "text/plain"}, 415, "application/json"),
-        ("POST", "/v4/jobs", {"jobs": [CRATE_JSON], "by": "disk full"}, {}, 503, "no room"),
-        ("POST", "/v4/jobs", {"jobs": [CRATE_JSON], "by": "nobody"}, {}, 409, "There is no 'nobody'."),
-        ("POST", "/v4/ask", {"jobs": []}, {}, 422, "length >= 1"),
-        ("POST", "/v4/jobs", b" " * (MAX_BYTES + 1), {}, 413, "at most"),
-        ("POST", "/v4/jobs", b" " * (MAX_TABLE_BYTES + 1), CSV, 413, "at most 1000000 bytes"),
-        ("POST", "/v4/jobs", b"", CSV, 422, "The table has 1 error:\n  row 1: no column name and no column kind"),
-        ("POST", "/v4/jobs", b"\x00", CSV, 422, "The table is not a text file in UTF-8"),
-        ("POST", "/v4/jobs", "a" + "," * 100, CSV, 422, "The table has 101 columns; a job table has at most 100"),
-        ("POST", "/v4/jobs?shift_begin=6", b"", CSV, 422, "shift_begin must be a date with time and zone, as"),
-        ("POST", "/v4/ask", b"", CSV, 415, "application/json"),
-        ("GET", "/v4/nothing", None, {}, 404, "Not Found"),
-        ("DELETE", "/v4/jobs", None, {}, 405, "Not Allowed"),
-        ("GET", "/v4/fleet", None, {"Host": "evil.example"}, 421, "evil.example"),
-        ("GET", "/page/cell.js", None, {"Host": "evil.example:80"}, 421, "evil.example"),
-        (
-            "POST",
-            "/v4/control",
-            {"request": "1", "action": {"action": "fly"}},
-            {},
-            422,
-            "`. Allowed: cancel, change, clear, pause, resume, settle",
-        ),
-        (
-            "POST",
-            "/v4/control",
-            {"request": "1", "action": {"action": "settle", "job": "a", "outcome": "so"}},
-            {},
-            422,
-            "`. Allowed: done, redo",
-        ),
-        (
-            "POST",
-            "/v4/jobs",
-            {"jobs": [CRATE_JSON], "by": "a\nb"},
-            {},
-            422,
-            "Submission.by must have 1 to 128 printable",
-        ),
-        ("POST", "/v4/jobs?by=%1b", b"name,kind,places\na,hold,pallet", CSV, 422, "Submission.by must have 1 to 128"),
-        ("POST", "/v4/control", {**PAUSE, "by": "\u202ea"}, {}, 422, "ControlRequest.by must have 1 to 128 printable"),
-        ("POST", "/v4/clear", {"arm": "a+1", "by": ".a"}, {}, 422, "ClearRequest.by must have 1 to 128 printable"),
-        ("POST", "/v4/reset", {"arm": "a+1", "by": "\r"}, {}, 422, "ResetBody.by must have 1 to 128 printable"),
-        ("POST", "/v4/alarms", {"alarm": "a", "by": "\r"}, {}, 422, "AcknowledgeBody.by must have 1 to 128 printable"),
-        ("POST", "/v4/control", {**PAUSE, "action": LATE}, {}, 422, "Change.due_s must be between 0 and"),
-        ("POST", "/v4/alarms", '{"alarm": "a", "by": "b", "by": "c"}', {}, 422, "An object has the field 'by' twice."),
-        ("POST", "/v4/alarms", b'{"alarm": "a", "by": "b", "x": "\xff"}', {}, 422, "Not"),
-        ("POST", "/v4/jobs?by=erp", {"jobs": [CRATE_JSON]}, {}, 422, "Parameters are for a table (text/csv);"),
-        ("POST", "/v4/ask", {"jobs": [CRATE_JSON]}, {"Content-Type": JSON + "; charset=latin-1"}, 415, "be UTF-8"),
-        (
-            "POST",
-            "/v4/ask",
-            b"x",
-            {"Content-Encoding": "gzip"},
-            415,
-            "must not be compressed (got Content-Encoding 'gzip",
-        ),
-        ("GET", "/v4/jobs?job=" + "x" * 10_000, None, {}, 422, "?job=NAME must have 1 to 128 printable characters"),
-        ("GET", "/v4/jobs?" + "job=abcdefghijklmnop&" * 3300, None, {}, 422, "The names of 3300 jobs have 62,7"),
-        (
-            "GET",
-            "/v4/fleet",
-            None,
-            {"Origin": "http://evil.example"},
-            403,
-            "may send no requests (got 'http://evil.exam",
-        ),
-        (
-            "GET",
-            "/v4/fleet",
-            None,
-            {"Origin": "null"},
-            403,
-            "Web pages of other hosts may send no requests (got 'null')",
-        ),
-        (
-            "POST",
-            "/v4/jobs",
-            {"jobs": []},
-            {"Sec-Fetch-Site": "cross-site"},
-            403,
-            "(got 'Sec-Fetch-Site: cross-site').",
-        ),
-        ("POST", "/v4/jobs", {"jobs": [{**CRATE_JSON, "kind": "fly"}]}, {}, 422, "`. Allowed: hold, pick_place"),
-        ("GET", "/v4/fleet?jobs=all", None, {}, 422, "?jobs=N is the number of jobs to list, 0..4096 (got 'all')."),
-        ("GET", "/v4/jobs?name=a", None, {}, 422, "There is no parameter 'name' of this request. Parameters: job."),
-        ("POST", "/v4/reset?arm=a", {"arm": "a"}, {}, 422, "There is no parameter 'arm' of this request. It has none."),
-    ],
-)
-def test_an_error_is_a_problem_document(gateway, method, path, body, headers, status, says):
-    got, kind, told = gateway.ask(method, path, body, headers)
+PROBLEMS = [
+    (422, "POST /v4/jobs", "Not a thermofleet.Submission", "{"),
+    (422, "POST /v4/jobs", "length >= 1", {"jobs": []}),
+    (422, "POST /v4/jobs", "place", {"jobs": [{**CRATE_JSON, "places": ["a", "b"]}]}),
+    (422, "POST /v4/jobs", "Not a", b"\xff"),
+    (415, "POST /v4/jobs", "application/json", {"jobs": [CRATE_JSON]}, {"Content-Type": "text/plain"}),
+    (503, "POST /v4/jobs", "no room", {"jobs": [CRATE_JSON], "by": "disk full"}),
+    (409, "POST /v4/jobs", "There is no 'nobody'.", {"jobs": [CRATE_JSON], "by": "nobody"}),
+    (422, "POST /v4/ask", "length >= 1", {"jobs": []}),
+    (413, "POST /v4/jobs", "at most", b" " * (MAX_BYTES + 1)),
+    (413, "POST /v4/jobs", "at most 1000000 bytes", b" " * (MAX_TABLE_BYTES + 1), CSV),
+    (422, "POST /v4/jobs", "The table has 1 error:\n  row 1: no column name and no column kind", b"", CSV),
+    (422, "POST /v4/jobs", "The table is not a text file in UTF-8", b"\x00", CSV),
+    (422, "POST /v4/jobs", "The table has 101 columns; a job table has at most 100", "a" + "," * 100, CSV),
+    (422, "POST /v4/jobs?shift_begin=6", "shift_begin must be a date with time and zone, as", b"", CSV),
+    (415, "POST /v4/ask", "application/json", b"", CSV),
+    (404, "GET /v4/nothing", "Not Found"),
+    (405, "DELETE /v4/jobs", "Not Allowed"),
+    (421, "GET /v4/fleet", "evil.example", None, {"Host": "evil.example"}),
+    (421, "GET /page/cell.js", "evil.example", None, {"Host": "evil.example:80"}),
+    (422, "POST /v4/control", "`. Allowed: cancel, change, clear, pause, resume, settle", {**PAUSE, "action": FLY}),
+    (422, "POST /v4/control", "`. Allowed: done, redo", {**PAUSE, "action": SETTLE}),
+    (422, "POST /v4/jobs", "Submission.by must have 1 to 128 printable", {"jobs": [CRATE_JSON], "by": "a\nb"}),
+    (422, "POST /v4/jobs?by=%1b", "Submission.by must have 1 to 128", b"name,kind,places\na,hold,pallet", CSV),
+    (422, "POST /v4/control", "ControlRequest.by must have 1 to 128 printable", {**PAUSE, "by": "\u202ea"}),
+    (422, "POST /v4/clear", "ClearRequest.by must have 1 to 128 printable", {"arm": "a+1", "by": ".a"}),
+    (422, "POST /v4/reset", "ResetBody.by must have 1 to 128 printable", {"arm": "a+1", "by": "\r"}),
+    (422, "POST /v4/alarms", "AcknowledgeBody.by must have 1 to 128 printable", {"alarm": "a", "by": "\r"}),
+    (422, "POST /v4/control", "Change.due_s must be between 0 and", {**PAUSE, "action": LATE}),
+    (422, "POST /v4/alarms", "An object has the field 'by' twice.", '{"alarm": "a", "by": "b", "by": "c"}'),
+    (422, "POST /v4/alarms", "Not", b'{"alarm": "a", "by": "b", "x": "\xff"}'),
+    (422, "POST /v4/jobs?by=erp", "Parameters are for a table (text/csv);", {"jobs": [CRATE_JSON]}),
+    (415, "POST /v4/ask", "be UTF-8", {"jobs": [CRATE_JSON]}, {"Content-Type": JSON + "; charset=latin-1"}),
+    (415, "POST /v4/ask", "must not be compressed (got Content-Encoding 'gzip", b"x", {"Content-Encoding": "gzip"}),
+    (422, "GET /v4/jobs?job=" + "x" * 10_000, "?job=NAME must have 1 to 128 printable characters"),
+    (422, "GET /v4/jobs?" + "job=abcdefghijklmnop&" * 3300, "The names of 3300 jobs have 62,7"),
+    (403, "GET /v4/fleet", "may send no requests (got 'http://evil.exam", None, {"Origin": "http://evil.example"}),
+    (403, "GET /v4/fleet", "Web pages of other hosts may send no requests (got 'null')", None, {"Origin": "null"}),
+    (403, "POST /v4/jobs", "(got 'Sec-Fetch-Site: cross-site').", {"jobs": []}, {"Sec-Fetch-Site": "cross-site"}),
+    (422, "POST /v4/jobs", "`. Allowed: hold, pick_place", {"jobs": [{**CRATE_JSON, "kind": "fly"}]}),
+    (422, "GET /v4/fleet?jobs=all", "?jobs=N is the number of jobs to list, 0..4096 (got 'all')."),
+    (422, "GET /v4/jobs?name=a", "There is no parameter 'name' of this request. Parameters: job."),
+    (422, "POST /v4/reset?arm=a", "There is no parameter 'arm' of this request. It has none.", {"arm": "a"}),
+]
+"""Status and request, what the reply says, and body and headers of the request."""
+
+
+@pytest.mark.parametrize("case", PROBLEMS)
+def test_an_error_is_a_problem_document(gateway, case):
+    status, request, says, *body_and_headers = case
+    got, kind, told = gateway.ask(*request.split(" ", 1), *body_and_headers)
     assert (got, kind) == (status, "application/problem+json")
     assert told["status"] == status
     assert says in told["detail"]
@@ -428,7 +382,7 @@ def test_a_token_may_do_what_its_role_may(guarded):
     status, _, told = ask(WATCHER, "POST", "/v4/jobs", {"jobs": [CRATE_JSON]})
     assert (status, told["detail"]) == (403, "This token has the role monitor; this request needs submitter.")
     assert ask(SENDER, "POST", "/v4/jobs", {"jobs": [CRATE_JSON]})[0] == 200
-    for path, body in (("control", {"request": "1", "action": {"action": "pause"}}), ("reset", {"arm": "arm_0"})):
+    for path, body in (("control", PAUSE), ("reset", {"arm": "arm_0"})):
         status, _, told = ask(SENDER, "POST", f"/v4/{path}", body)
         assert (status, told["detail"]) == (403, "This token has the role submitter; this request needs operator.")
 
