@@ -102,6 +102,26 @@ def log_of(
     return ShiftLog(card=card or {}, arms=arms, limits=limits, readings=readings, events=events)
 
 
+def shift(
+    *events: Event,
+    temp_c: float | None = None,
+    samples: int = 1000,
+    arms: tuple[str, ...] = ("arm_a", "arm_b"),
+    card: dict[str, Any] | None = None,
+    **fields: Any,
+) -> ShiftLog:
+    """A shift with a reading a second, with one temperature of all motors if it is given, and `fields` of its log."""
+    readings = telemetry(samples, len(arms))
+    if temp_c is not None:
+        readings = replace(readings, temp_c=np.full(readings.temp_c.shape, temp_c))
+    return replace(log_of(readings, arms, events, card), **fields)
+
+
+def why_late(log: ShiftLog) -> str:
+    """What the report says of its late jobs."""
+    return lateness_text(log, late_jobs(log))
+
+
 def held(text: str, key: str) -> str:
     """The text of an element that a script reads."""
     (found,) = re.findall(rf'<script type="text/plain" id="{key}">([^<]*)</script>', text)
@@ -464,6 +484,9 @@ FAULTED = (
     event(300.0, "recover", job=""),
 )
 OUT = (event(10.0, "fault", job="", reason="joint 2 passed 75 °C"), event(590.0, "recover", job=""))
+NOT_RECORDED = "it was never awarded, and no offer for it or for a job with the same work is recorded"
+PLACE_TAKEN = "arm_a was idle: the job's place was taken, or the policy let the job wait"
+RELEASE, LATE = event(0.0, "release", job="long-1"), done("long-1", 600, 900, 60.0)
 
 
 @pytest.mark.parametrize(
@@ -475,62 +498,41 @@ OUT = (event(10.0, "fault", job="", reason="joint 2 passed 75 °C"), event(590.0
         (OUT, 30.0, "arm_a was out after a fault"),
         (FAULTED, 30.0, "arm_a faulted during it at 0:02:30"),
         ((), 62.0, "arm_a was idle above the warning limit"),
-        ((), 30.0, "arm_a was idle: the job's place was taken, or the policy let the job wait"),
+        ((), 30.0, PLACE_TAKEN),
         ((), math.nan, "arm_a was absent, or no state was recorded"),
     ],
 )  # fmt: skip
 def test_the_reason_of_a_late_job_is_what_took_most_of_its_wait(before, temp_c: float, reason: str) -> None:
-    readings = telemetry(1000)
-    readings = replace(readings, temp_c=np.full(readings.temp_c.shape, temp_c))
     lengths_s = {"short-1": 200.0, "short-2": 200.0, "long-2": 400.0, "long-1": 300.0}
-    events = (event(0.0, "release", job="long-1"), *before, *done("long-1", 600, 900, 60.0))
-    log = replace(
-        log_of(readings, ("arm_a", "arm_b"), events),
-        jobs=tuple(record(job, 840.0) for job in lengths_s),
-        offers=tuple(offered(e.job, e.time_s, lengths_s[e.job]) for e in events if e.kind == "award"),
-    )
-    assert lateness_text(log, late_jobs(log)) == f"long-1 finished 1 min late: {reason}."
+    events = (RELEASE, *before, *LATE)
+    offers = tuple(offered(e.job, e.time_s, lengths_s[e.job]) for e in events if e.kind == "award")
+    log = shift(*events, temp_c=temp_c, jobs=tuple(record(job, 840.0) for job in lengths_s), offers=offers)
+    assert why_late(log) == f"long-1 finished 1 min late: {reason}."
 
 
 def test_the_reason_of_a_late_job_names_only_the_arms_that_it_holds_for() -> None:
-    events = (event(0.0, "release", job="long-1"), *done("long-2", -10, 300, arm="arm_b"), *OUT)
     at_work = replace(offered("long-2", -10, 310), arm="arm_b")
     able = tuple(replace(offered("long-1", 600.0, 300.0), arm=arm) for arm in ("arm_a", "arm_b"))
-    log = replace(
-        log_of(telemetry(1000), ("arm_a", "arm_b"), (*events, *done("long-1", 600, 900, 60.0))),
-        jobs=(record("long-1", 840.0), record("long-2", 840.0)),
-        offers=(at_work, *able),
-    )
-    assert lateness_text(log, late_jobs(log)).endswith(": arm_a was out after a fault.")
+    jobs, before = (record("long-1", 840.0), record("long-2", 840.0)), done("long-2", -10, 300, arm="arm_b")
+    log = shift(RELEASE, *before, *OUT, *LATE, jobs=jobs, offers=(at_work, *able))
+    assert why_late(log).endswith(": arm_a was out after a fault.")
     out = replace(log, events=(*log.events, event(400.0, "fault", "arm_b", ""), event(500.0, "recover", "arm_b", "")))
-    assert lateness_text(out, late_jobs(out)).endswith(": arm_a and arm_b were out after a fault.")
+    assert why_late(out).endswith(": arm_a and arm_b were out after a fault.")
 
 
 def test_pauses_of_all_arms_that_can_do_a_late_job_count_together() -> None:
     """Each pause is shorter than the idle time of both arms; an arm that cannot do the job is left out."""
-    readings, arms = telemetry(1000, 3), ("arm_a", "arm_b", "arm_c")
-    able = [replace(offered("long-1", 600.0, 300.0), arm=arm, feasible=arm != "arm_c") for arm in arms]
-    halts = [Halt(arm=arm, start_s=0.0, end_s=350.0, reason=f"{arm} was paused by ann") for arm in arms]
-    log = replace(
-        log_of(
-            replace(readings, temp_c=np.full(readings.temp_c.shape, 30.0)),
-            arms,
-            (event(0.0, "release", job="long-1"), *done("long-1", 600, 900, 60.0)),
-        ),
-        jobs=(record("long-1", 840.0),),
-        offers=tuple(able),
-        halts=tuple(halts),
-    )
+    arms, jobs = ("arm_a", "arm_b", "arm_c"), (record("long-1", 840.0),)
+    able = tuple(replace(offered("long-1", 600.0, 300.0), arm=arm, feasible=arm != "arm_c") for arm in arms)
+    halts = tuple(Halt(arm=arm, start_s=0.0, end_s=350.0, reason=f"{arm} was paused by ann") for arm in arms)
+    log = shift(RELEASE, *LATE, temp_c=30.0, arms=arms, jobs=jobs, offers=able, halts=halts)
     paused = "arm_a was paused by ann from 0:00:00 to 0:05:50 and arm_b was paused by ann from 0:00:00 to 0:05:50"
-    assert lateness_text(log, late_jobs(log)) == f"long-1 finished 1 min late: {paused}."
+    assert why_late(log) == f"long-1 finished 1 min late: {paused}."
 
 
 def test_late_jobs_turn_the_badge_red_and_abandoned_ones_come_last() -> None:
-    events = (event(0.0, "release", job="long-1"), *done("long-1", 0, 900, 60.0))
-    log = replace(
-        log_of(telemetry(1000), ("arm_a", "arm_b"), events, {"status": "finished"}),
-        jobs=(record("long-1", 840.0), record("gone-1", 100.0, "expired"), record("open-1", 500.0, "waiting")),
-    )
+    jobs = (record("long-1", 840.0), record("gone-1", 100.0, "expired"), record("open-1", 500.0, "waiting"))
+    log = shift(RELEASE, *done("long-1", 0, 900, 60.0), card={"status": "finished"}, jobs=jobs)
     unread = replace(log, readings=Telemetry.empty(2), offers=(offered("open-1", 500.0, 9.0),), events=(
         event(0.0, "release", job="open-1"), event(1000.0, "warning", job="")))  # fmt: skip
     assert lateness_text(unread, late_jobs(unread)[:1]).endswith("what arm_a did meanwhile is not recorded.")
@@ -555,32 +557,22 @@ IN_ORDER = {"jobs": [row_of_table("A1"), row_of_table("A2", "A1")]}
     [
         (IN_ORDER, 900.0, "it waited for A1, which finished at 0:15:00"),
         (IN_ORDER, None, "it waits for A1, which is not finished (waiting)"),
-        (IN_ORDER, 300.0, "arm_a was idle: the job's place was taken, or the policy let the job wait"),
+        (IN_ORDER, 300.0, PLACE_TAKEN),
         ({"jobs": [row_of_table("A1"), row_of_table("A2")], "slots": 1}, None,
-         "arm_a was idle: the job's place was taken, or the policy let the job wait, or it had no slot "
-         "(1 for up to 2 waiting jobs)"),
+         f"{PLACE_TAKEN}, or it had no slot (1 for up to 2 waiting jobs)"),
         ({"jobs": [row_of_table("A1"), row_of_table("A2", kind="pick_place")]}, 300.0,
-         "it was never awarded, and no offer for it or for a job with the same work is recorded"),
-        ({}, 300.0, "it was never awarded, and no offer for it or for a job with the same work is recorded"),
+         NOT_RECORDED),
+        ({}, 300.0, NOT_RECORDED),
     ],
 )  # fmt: skip
 def test_a_row_of_a_table_that_was_never_awarded_has_a_reason(card, finished_s: float | None, reason: str) -> None:
     first = replace(record("A1", 2000.0, "waiting" if finished_s is None else "finished"), finished_s=finished_s)
-    readings = telemetry(1000)
-    log = replace(
-        log_of(
-            replace(readings, temp_c=np.full(readings.temp_c.shape, 30.0)), ("arm_a", "arm_b"), (), {"scenario": card}
-        ),
-        jobs=(first, record("A2", 500.0, "waiting")),
-        offers=(offered("A1", 10.0, 100.0),),
-    )
-    (late,) = late_jobs(log)
-    assert lateness_text(log, [late]) == f"A2 is unfinished 8 min 20 s after its due date: {reason}."
+    jobs, offers = (first, record("A2", 500.0, "waiting")), (offered("A1", 10.0, 100.0),)
+    log = shift(temp_c=30.0, card={"scenario": card}, jobs=jobs, offers=offers)
+    assert why_late(log) == f"A2 is unfinished 8 min 20 s after its due date: {reason}."
 
 
 HOLDS = {"name": "hold", "kind": "hold", "places": ["a"], "payload_kg": [0.5, 2.5]}
-NOT_RECORDED = "it was never awarded, and no offer for it or for a job with the same work is recorded"
-PLACE_TAKEN = "arm_a was idle: the job's place was taken, or the policy let the job wait"
 
 
 @pytest.mark.parametrize(
@@ -597,26 +589,16 @@ PLACE_TAKEN = "arm_a was idle: the job's place was taken, or the policy let the 
 def test_offers_for_another_job_count_only_if_its_recorded_work_is_the_same(
     streams: list[dict[str, Any]], payload_kg: float, reason: str
 ) -> None:
-    readings = telemetry(1000)
-    log = replace(
-        log_of(
-            replace(readings, temp_c=np.full(readings.temp_c.shape, 30.0)),
-            ("arm_a", "arm_b"),
-            card={"scenario": {"jobs": streams}},
-        ),
-        jobs=(
-            replace(record("hold-250", 500.0, "waiting"), payload_kg=2.5),
-            replace(record("hold-251", 900.0), payload_kg=payload_kg),
-        ),
-        offers=(offered("hold-251", 10.0, 100.0),),
-    )
-    assert lateness_text(log, late_jobs(log)).endswith(f": {reason}.")
+    waits = replace(record("hold-250", 500.0, "waiting"), payload_kg=2.5)
+    jobs, offers = (waits, replace(record("hold-251", 900.0), payload_kg=payload_kg)), (offered("hold-251", 10.0, 9.0),)
+    log = shift(temp_c=30.0, card={"scenario": {"jobs": streams}}, jobs=jobs, offers=offers)
+    assert why_late(log).endswith(f": {reason}.")
 
 
 def test_an_arm_that_was_awarded_a_job_can_do_it_without_a_recorded_offer() -> None:
-    events = (event(0.0, "release", job="long-1"), *OUT, *done("long-1", 600, 900, 60.0))
-    log = replace(log_of(telemetry(1000), ("arm_a", "arm_b"), events), jobs=(record("long-1", 840.0),))
-    assert lateness_text(log, late_jobs(log)).endswith(": arm_a was out after a fault.")
+    assert why_late(shift(RELEASE, *OUT, *LATE, jobs=(record("long-1", 840.0),))).endswith(
+        ": arm_a was out after a fault."
+    )
 
 
 @pytest.mark.parametrize(
@@ -633,12 +615,9 @@ def test_an_arm_that_was_awarded_a_job_can_do_it_without_a_recorded_offer() -> N
 def test_a_fleet_at_a_standstill_is_told(done_s: float, state: str, able: bool, status: str, stands: bool) -> None:
     offers = (replace(offered("open-1", 50.0, 9.0), feasible=able), replace(offered("done-1", 0.0, 9.0), arm="arm_b"))
     unable = replace(offers[0], arm="arm_b", feasible=False)
-    log = replace(
-        log_of(telemetry(1000), ("arm_a", "arm_b"), done("done-1", 0.0, done_s), {"status": status}),
-        jobs=(record("done-1", 840.0), record("open-1", 5000.0, state)),
-        offers=(*offers, unable),
-    )
-    told = verdict(log)
+    jobs = (record("done-1", 840.0), record("open-1", 5000.0, state))
+    events = done("done-1", 0.0, done_s)
+    told = verdict(shift(*events, card={"status": status}, jobs=jobs, offers=(*offers, unable)))
     sentence = (
         "1 job still waited at the end, though arm_a was idle from 0:01:40 to the end: see why jobs are late in the "
         "report, and run another policy."
@@ -651,22 +630,18 @@ def test_a_fleet_at_a_standstill_is_told(done_s: float, state: str, able: bool, 
 def test_a_row_of_a_table_waits_for_the_named_rows_only() -> None:
     card = {"scenario": {"jobs": [row_of_table("A"), row_of_table("A-2"), row_of_table("B-2", "A")]}}
     jobs = (replace(record("A", 900.0), finished_s=100.0), record("A-2", 900.0, "waiting"), record("B-2", 900.0))
-    log = replace(log_of(telemetry(1000), ("arm_a", "arm_b"), (), card), jobs=jobs)
-    assert log.last_before["B-2"] == (jobs[0], 100.0)
+    assert shift(card=card, jobs=jobs).last_before["B-2"] == (jobs[0], 100.0)
 
 
 def test_an_arm_without_recorded_states_at_the_end_is_not_idle_beside_waiting_jobs() -> None:
-    readings = telemetry(1000)
-    readings.temp_c[500:, 0] = np.nan
-    log = log_of(readings, ("arm_a",), (), {"status": "finished"})
-    assert standstill(replace(log, jobs=(record("open-1", 5000.0, "waiting"),))) is None
+    log = shift(arms=("arm_a",), card={"status": "finished"}, jobs=(record("open-1", 5000.0, "waiting"),))
+    log.readings.temp_c[500:, 0] = np.nan
+    assert standstill(log) is None
 
 
 def test_jobs_that_no_record_gives_an_arm_are_no_jobs_beside_idle_arms() -> None:
-    log = replace(
-        log_of(telemetry(1000), ("arm_a", "arm_b"), (), {"status": "finished"}),
-        jobs=(record("open-1", 5000.0, "waiting"), record("open-2", 5000.0, "waiting")),
-    )
+    jobs = (record("open-1", 5000.0, "waiting"), record("open-2", 5000.0, "waiting"))
+    log = shift(card={"status": "finished"}, jobs=jobs)
     told = verdict(log)
     unknown = "still waited at the end, after at least 15 min; which arms can do"
     assert (told.badge, told.good) == ("2 jobs left waiting", False)
@@ -681,8 +656,7 @@ def test_jobs_that_no_record_gives_an_arm_are_no_jobs_beside_idle_arms() -> None
 def test_a_job_that_was_due_before_its_release_and_never_taken_has_no_time_of_work() -> None:
     events = (event(300.0, "release", job="open-1"), event(1000.0, "warning", job=""))
     jobs = (replace(record("open-1", 60.0, "waiting"), release_s=300.0),)
-    log = replace(log_of(telemetry(1000), ("arm_a", "arm_b"), events), jobs=jobs)
-    assert lateness_text(log, late_jobs(log)).endswith(": it was due 4 min before its release.")
+    assert why_late(shift(*events, jobs=jobs)).endswith(": it was due 4 min before its release.")
 
 
 @pytest.mark.parametrize(
@@ -690,21 +664,20 @@ def test_a_job_that_was_due_before_its_release_and_never_taken_has_no_time_of_wo
 )
 def test_a_job_that_came_back_for_a_break_or_a_failure_is_late_by_that(kind: str, told: str) -> None:
     events = (
-        event(0.0, "release", job="long-1"),
+        RELEASE,
         event(100.0, "award", job="long-1"),
         event(200.0, kind, job="", value=400.0),
         event(250.0, "give_back" if kind == "break" else "return", job="long-1", value=2.0),
         event(260.0, "home", job="long-1"),
-        *done("long-1", 600, 900, 60.0),
+        *LATE,
     )
-    log = replace(log_of(telemetry(1000), ("arm_a", "arm_b"), events), jobs=(record("long-1", 840.0),))
-    assert lateness_text(log, late_jobs(log)) == f"long-1 finished 1 min late: arm_a {told}."
+    assert why_late(shift(*events, jobs=(record("long-1", 840.0),))) == f"long-1 finished 1 min late: arm_a {told}."
 
 
 def test_a_job_that_is_given_up_with_another_one_says_so() -> None:
     events = (event(0.0, "release", job="a"), event(300.0, "give_up", "", "a", reason="a job before it was given up"))
-    log = replace(log_of(telemetry(1000), ("arm_a", "arm_b"), events), jobs=(record("a", 500.0, "given_up"),))
-    assert lateness_text(log, late_jobs(log)).endswith(": a job before it was given up.")
+    log = shift(*events, jobs=(record("a", 500.0, "given_up"),))
+    assert why_late(log).endswith(": a job before it was given up.")
 
 
 def test_an_empty_list_of_a_card_is_none() -> None:
@@ -721,7 +694,7 @@ def test_the_event_table_has_jobs_that_were_given_up() -> None:
 def test_a_shift_that_ended_with_its_last_job_says_so() -> None:
     for time_s, count in ((670.0, 1), (7200.0, 0)):
         card = {"status": "finished", "time_s": time_s, "scenario": {"horizon_s": 7200.0}}
-        told = verdict(log_of(telemetry(670), ("arm_a", "arm_b"), (), card)).sentences
+        told = verdict(shift(samples=670, card=card)).sentences
         early = "The shift of 2 h ended after 11 min 10 s, with its last job: all figures are of that time."
         assert told.count(early) == count
 
@@ -730,11 +703,9 @@ def test_a_shift_that_ended_with_its_last_job_says_so() -> None:
 def test_an_offer_names_the_break_or_the_pause_of_its_arm(at_s: float, why: str) -> None:
     events = (event(300.0, "break", job="", value=600.0), event(900.0, "break_end", job=""), *done("a-1", 0.0, 200.0))
     barred = replace(offered("b-1", at_s, 60.0), awarded=False, free=False, p_saturation=0.25)
-    log = replace(
-        log_of(telemetry(1000), ("arm_a", "arm_b"), (*events, event(at_s, "award", "arm_b", "b-1"))),
-        offers=(replace(offered("b-1", at_s, 60.0), arm="arm_b"), barred),
-        halts=(Halt(arm="arm_a", start_s=920.0, end_s=math.inf, reason="arm_a was paused by ann"),),
-    )
+    offers = (replace(offered("b-1", at_s, 60.0), arm="arm_b"), barred)
+    halt = Halt(arm="arm_a", start_s=920.0, end_s=math.inf, reason="arm_a was paused by ann")
+    log = shift(*events, event(at_s, "award", "arm_b", "b-1"), offers=offers, halts=(halt,))
     assert f"<td>arm_a: P 0.25, 1 min ({why})</td>" in report_html(log)
     assert offer_text(log.offers_behind("b-1", "arm_b", at_s)[1]).endswith(f"({why})")  # as a trace has it
 
@@ -746,20 +717,15 @@ def test_other_offers_are_ordered_by_what_the_arms_predicted() -> None:
         replace(offered("b-1", 10.0, 60.0), arm=arm, awarded=False, feasible=feasible, p_saturation=p, peak_c=peak_c)
         for arm, (feasible, p, peak_c) in zip(arms[1:], values, strict=True)
     ]
-    log = replace(
-        log_of(telemetry(100, 6), arms, (event(10.0, "award", "arm_a", "b-1"),)),
-        offers=(offered("b-1", 10.0, 60.0), *others),
-    )
+    offers = (offered("b-1", 10.0, 60.0), *others)
+    log = shift(event(10.0, "award", "arm_a", "b-1"), samples=100, arms=arms, offers=offers)
     (cell,) = re.findall(r"<td>([^<]*cannot do it)</td>", report_html(log))
     assert [part.partition(":")[0] for part in cell.split("; ")] == ["d", "c", "b", "e", "f"]
 
 
 def test_the_temperatures_tell_a_failure_from_a_fault() -> None:
-    failure = event(400.0, "failure", job=""), event(600.0, "recover", job="")
-    log = log_of(
-        telemetry(1000), ("arm_a", "arm_b"), (event(10.0, "fault", job=""), event(99.0, "recover", job=""), *failure)
-    )
-    shown = drawn(report_html(log), 1)
+    times = ((10.0, "fault"), (99.0, "recover"), (400.0, "failure"), (600.0, "recover"))
+    shown = drawn(report_html(shift(*(event(time_s, kind, job="") for time_s, kind in times))), 1)
     lines = [shape for shape in shown["layout"]["shapes"] if shape.get("xref") == "x" and shape["type"] == "line"]
     legend = {trace["name"]: trace["marker"]["color"] for trace in shown["data"] if trace["mode"] == "markers"}
     assert legend == {"out after a fault": lines[0]["line"]["color"], "failed, not by heat": lines[1]["line"]["color"]}
@@ -769,11 +735,10 @@ def test_the_temperatures_tell_a_failure_from_a_fault() -> None:
 def test_a_break_after_the_due_date_is_no_reason_to_be_late() -> None:
     pause = event(300.0, "break", job="", value=600.0), event(900.0, "break_end", job="")
     events = (event(0.0, "release", job="late-1"), *done("other-1", 1.0, 250.0), *pause)
-    log = replace(
-        log_of(telemetry(1000), ("arm_a", "arm_b"), events, {"status": "finished"}),
-        jobs=(record("late-1", 200.0, "waiting"), record("other-1", 900.0)),
-        offers=(offered("late-1", 1.0, 100.0), offered("other-1", 1.0, 249.0)),
+    offers = (offered("late-1", 1.0, 100.0), offered("other-1", 1.0, 249.0))
+    after, before = (
+        why_late(shift(*events, jobs=(record("late-1", due_s, "waiting"), record("other-1", 900.0)), offers=offers))
+        for due_s in (200.0, 400.0)
     )
-    assert "break" not in lateness_text(log, late_jobs(log))
-    before = replace(log, jobs=(record("late-1", 400.0, "waiting"), record("other-1", 900.0)))
-    assert lateness_text(before, late_jobs(before)).endswith("arm_a had a break.")
+    assert "break" not in after
+    assert before.endswith("arm_a had a break.")
