@@ -85,6 +85,23 @@ def operation(number):
     return Operation("boss", number / 2, request, number)
 
 
+def recorded(folder, *messages, fleet="f", status="recording"):
+    """The recorder of these messages, which are written."""
+    recorder = Recorder.open(folder, fleet)
+    for message in messages:
+        recorder.add("", message)
+    recorder.write(status=status)
+    return recorder
+
+
+def stub():
+    """A client of a fleet in which no arm is present."""
+    link = MagicMock(fleet="f")
+    link.tokens.return_value = set()
+    link.__enter__.return_value = link
+    return link
+
+
 @examples(40)
 @given(st.lists(st.tuples(st.integers(0, 15), st.sampled_from(["", "write", "crash"])), min_size=1, max_size=20))
 def test_every_message_is_kept_once_and_gaps_are_known(tmp_path_factory, steps):
@@ -114,8 +131,7 @@ def test_every_message_is_kept_once_and_gaps_are_known(tmp_path_factory, steps):
 
 def test_events_are_sought_of_an_arm_that_is_known_by_its_states_alone(tmp_path):
     """The only event of an arm may have been missed; nothing later shows that there was one."""
-    recorder, asked = Recorder.open(tmp_path, "f"), list[str]()
-    recorder.add("a", state("a", 1))
+    recorder, asked = recorded(tmp_path, state("a", 1)), list[str]()
     link = MagicMock(fleet="f", subscribe=lambda key, *_, **__: asked.append(key))
     GapFetcher(recorder, lambda: link).step(time.monotonic() + SWEEP_S)
     unknown = [keys.of_every("f", *each) for each in (("auction", "result"), ("auction", "operation"))]
@@ -146,29 +162,21 @@ def test_the_requests_that_arms_publish_without_an_auctioneer_are_kept_once(tmp_
 
 
 def test_messages_of_a_restarted_arm_are_kept(tmp_path):
-    recorder = Recorder.open(tmp_path, "f")
-    for message in (state("a", 7, 70.0), state("a", 0, 80.0), state("a", 1, 81.0), state("a", 0, 80.0)):
-        recorder.add("a", message)
-    count = recorder.counts["telemetry of a"]
+    sent = (state("a", 7, 70.0), state("a", 0, 80.0), state("a", 1, 81.0), state("a", 0, 80.0))
+    count = recorded(tmp_path, *sent).counts["telemetry of a"]
     assert (count.kept, count.missed) == (3, 0)
 
 
 def test_a_new_epoch_in_the_same_folder_is_no_repetition(tmp_path):
     """A second shift begins its numbers and its time again; caches repeat messages of both."""
-    recorder = Recorder.open(tmp_path, "f")
     sent = [
         replace(message, epoch=epoch)
         for epoch in ("one", "two")
         for number in range(1, 6)
         for message in (state("a", number), event("a", number + 10**9), result(number - 1), operation(number - 1))
     ]
-    for message in (*sent, *sent[-12:]):
-        recorder.add("", message)
-    recorder.write()
-    again = Recorder.open(tmp_path, "f")
-    for message in sent[-12:]:
-        again.add("", message)
-    again.write(status="finished")
+    recorded(tmp_path, *sent, *sent[-12:])
+    recorded(tmp_path, *sent[-12:], status="finished")
     assert sorted(map(repr, open_messages(tmp_path))) == sorted(map(repr, sent))
     assert read_parts(tmp_path, "gaps").num_rows == 0
     assert read_card(tmp_path).status == "finished"
@@ -180,11 +188,8 @@ def test_a_repeated_message_of_another_time_is_no_restart(tmp_path, make, table)
 
     Both repeat all after a restart.
     """
-    recorder = Recorder.open(tmp_path, "f")
     sent = [replace(make(number), time_s=time_s) for number, time_s in enumerate((10.0, 30.0, 20.0, 40.0))]
-    for message in (*sent[:3], *sent, sent[1]):
-        recorder.add("", message)
-    recorder.write(status="finished")
+    recorded(tmp_path, *sent[:3], *sent, sent[1], status="finished")
     assert read_parts(tmp_path, table)["number"].to_pylist() == [0, 2, 1, 3]
     assert read_parts(tmp_path, "gaps").num_rows == 0
 
@@ -196,9 +201,7 @@ def test_a_part_that_a_crash_left_without_its_card_is_not_read_later(tmp_path):
     card = (tmp_path / CARD).read_bytes()
     before.write()
     (tmp_path / CARD).write_bytes(card)  # as if it had crashed before it wrote this one
-    again = Recorder.open(tmp_path, "f")
-    again.add("a", state("a", 1))
-    again.write()
+    again = recorded(tmp_path, state("a", 1))
     again.add("boss", operation(0))
     again.write()
     assert len(read_parts(tmp_path, "operations").to_pylist()) == 1
@@ -301,12 +304,7 @@ def test_the_cell_of_the_auctioneer_is_kept_and_asked_for_once(tmp_path):
 
 def test_a_replay_publishes_the_same_messages_and_refuses_names_of_present_arms(tmp_path):
     (tmp_path / "first").mkdir()
-    first = Recorder.open(tmp_path / "first", "f")
-    for tick in range(20):
-        first.add("a", state("a", tick))
-        first.add("a", event("a", tick))
-        first.add("boss", result(tick))
-    first.write()
+    recorded(tmp_path / "first", *(m for tick in range(20) for m in (state("a", tick), event("a", tick), result(tick))))
     messages = open_messages(tmp_path / "first")
     with Router() as router, Recording(router.endpoint, tmp_path / "second"), BusClient(router.endpoint, "f") as link:
         # The subscription may follow the card by some time.
@@ -324,29 +322,18 @@ def test_a_replay_publishes_the_same_messages_and_refuses_names_of_present_arms(
 
 def test_a_replay_begins_with_the_first_state(tmp_path):
     """A recorder of a running fleet gets events and results of long ago from caches."""
-    recorder = Recorder.open(tmp_path, "f")
-    for number in range(3):
-        recorder.add("boss", result(number))
-    for tick in range(1200, 1205):
-        recorder.add("a", state("a", tick))
-    recorder.write()
-    link = MagicMock(fleet="f")
-    link.tokens.return_value = set()
+    recorded(tmp_path, *map(result, range(3)), *(state("a", tick) for tick in range(1200, 1205)))
     began_s = time.monotonic()
-    count = replay(open_messages(tmp_path), link, connect=lambda: link, speed=10.0, stopped=lambda: False)
+    count = replay(open_messages(tmp_path), stub(), connect=stub, speed=10.0, stopped=lambda: False)
     assert count == (8, 0, 3)
     assert 0.4 <= time.monotonic() - began_s < 60.0
 
 
 def test_a_replay_publishes_a_request_under_the_key_of_its_arm_or_auctioneer(tmp_path):
-    recorder = Recorder.open(tmp_path, "f")
-    recorder.add("a", state("a", 1))
-    recorder.add("boss", operation(1))
+    recorder = recorded(tmp_path, state("a", 1), operation(1))
     recorder.add_unnumbered("a", Operation("a", 2.0, ControlRequest("pause", Pause(), "ann")))
     recorder.write()
-    link, arm = MagicMock(fleet="f"), MagicMock(fleet="f")
-    link.tokens.return_value = set()
-    arm.__enter__.return_value = arm
+    link, arm = stub(), stub()
     messages = open_messages(tmp_path)
     assert replay(messages, link, connect=lambda: arm, speed=100.0, stopped=lambda: False) == (3, 0, 1)
     link.publisher.assert_called_once_with(keys.of_auction("f", "boss", "operation"), Operation)
@@ -354,12 +341,8 @@ def test_a_replay_publishes_a_request_under_the_key_of_its_arm_or_auctioneer(tmp
 
 
 def test_a_replay_shows_every_arm_to_a_subscriber_without_history_and_counts_states_that_come_too_soon(tmp_path):
-    recorder = Recorder.open(tmp_path, "f")
-    arms = {"a", "b", "c", "d"}
-    for tick in range(20):
-        for arm in sorted(arms):
-            recorder.add(arm, state(arm, tick))
-    recorder.write()
+    arms = "abcd"
+    recorded(tmp_path, *(state(arm, tick) for tick in range(20) for arm in arms))
     messages, seen = open_messages(tmp_path), []
     with Router(state_hz=keys.CHANNEL["arm", "state"].limit_hz) as router:
         connect = partial(BusClient, router.endpoint, "f")
@@ -367,9 +350,7 @@ def test_a_replay_shows_every_arm_to_a_subscriber_without_history_and_counts_sta
             other.subscribe(keys.of_every_arm("f", "state"), State, lambda name, _: seen.append(name))
             assert replay(messages, link, connect=connect, speed=40.0, stopped=lambda: False) == (80, 0, 0)
             serve_until(lambda: all(seen.count(arm) >= 10 for arm in arms), other)
-    stub = MagicMock(fleet="f")
-    stub.tokens.return_value = set()
-    assert replay(messages, stub, connect=lambda: stub, speed=80.0, stopped=lambda: False) == (40, 40, 0)
+    assert replay(messages, stub(), connect=stub, speed=80.0, stopped=lambda: False) == (40, 40, 0)
 
 
 def test_two_recorders_cannot_share_a_folder(tmp_path):
@@ -433,21 +414,12 @@ def test_the_work_and_events_of_a_recording_are_those_of_a_run(tmp_path):
 
 def test_the_heat_of_a_recording_has_the_closed_forms_of_its_laws(tmp_path):
     """An hour at the temperature of the insulation class uses 1/20,000 of its life; the links warm by 20 K."""
-    recorder = Recorder.open(tmp_path, "shop")
+    states = list[State]()
     for tick in range(61):
-        housing = (25.0 + 20.0 * tick / 60.0,) * 7
-        state = State(
-            arm="hot",
-            tick=tick,
-            time_s=60.0 * tick,
-            mode="idle",
-            temp_c=(155.0,) * 7,
-            headroom_k=1.0,
-            housing_c=housing,
-        )
-        recorder.add("hot", state)
-        recorder.add("bare", State(arm="bare", tick=tick, time_s=60.0 * tick, mode="idle", temp_c=(), headroom_k=1.0))
-    recorder.write(status="finished")
+        housing_c = (25.0 + 20.0 * tick / 60.0,) * 7
+        states.append(State("hot", tick, 60.0 * tick, "idle", (155.0,) * 7, 1.0, housing_c=housing_c))
+        states.append(State("bare", tick, 60.0 * tick, "idle", (), 1.0))
+    recorded(tmp_path, *states)
     found = heat_use(read_parts(tmp_path, "telemetry"), ["hot", "bare"])
     assert found["insulation_ppb"] == {"hot": pytest.approx(1e9 / 20_000.0)}
     assert found["tool_drift_mm"] == {"hot": pytest.approx(1e3 * 23.6e-6 * 20.0 * 1.1878, rel=1e-3)}
@@ -455,12 +427,8 @@ def test_the_heat_of_a_recording_has_the_closed_forms_of_its_laws(tmp_path):
 
 def test_a_report_names_missing_messages_and_returned_jobs(tmp_path):
     recorder = record_events(tmp_path / "r", LOG[:2])
-    for number, status in enumerate(
-        (("b-1", "awarded", "arm_1"), ("b-1", "waiting", ""), ("b-1", "finished", "arm_0"))
-    ):
-        job, state, arm = status
-        told = JobStatus(job=job, state=state, arm=arm, cycles=2)
-        recorder.add("boss", Result(auctioneer="boss", number=2 * number, time_s=20.0 + number, status=told))
+    for number, (state, arm) in enumerate((("awarded", "arm_1"), ("waiting", ""), ("finished", "arm_0"))):
+        recorder.add("boss", Result("boss", 2 * number, 20.0 + number, JobStatus("b-1", state, arm, cycles=2)))
     recorder.write(status="finished")
     html = open_recording(tmp_path / "r").page()
     assert "returned to the queue, 2 cycles kept" in html
@@ -504,21 +472,14 @@ def test_a_report_lists_alarms_and_requests_among_the_events_and_names_who(tmp_p
 
 def test_late_jobs_of_a_recording_and_of_a_run_are_counted_alike(tmp_path):
     """Second method: the same jobs as records of a run. What was due after the end of the shift is not late."""
-    states = {
-        "a-1": "awarded",
-        "b-1": "finished",
-        "open-1": "unfinished",
-        "after-1": "unfinished",
-        "gone-1": "given_up",
-    }
+    states = {"a-1": "awarded", "b-1": "finished", **dict.fromkeys(("open-1", "after-1"), "unfinished")}
+    states["gone-1"] = "given_up"
     due_s = {"a-1": 70.0, "b-1": 18.0, "open-1": 60.0, "after-1": 95.0, "gone-1": 50.0, "stop-1": 40.0}
     recorder = record_events(tmp_path / "r", LOG)
     for number, (job, state) in enumerate((states | {"stop-1": "cancelled"}).items()):
         reason = EXPIRED if job == "gone-1" else ""
-        status = JobStatus(
-            job, state, reason=reason, due_s=due_s[job], release_s=5.0, shift_ended=state == "unfinished"
-        )
-        recorder.add("boss", Result("boss", number, 90.0, status))
+        more = {"reason": reason, "due_s": due_s[job], "release_s": 5.0, "shift_ended": state == "unfinished"}
+        recorder.add("boss", Result("boss", number, 90.0, JobStatus(job, state, **more)))
     recorder.write(status="finished")
     live = open_recording(tmp_path / "r")
     more = {"release_s": 5.0, "finished_s": None, "value": 1.0, "payload_kg": 0.0, "cycles": 1}
@@ -870,11 +831,8 @@ def test_the_rows_of_a_removed_part_are_counted_as_missing(tmp_path):
 
 def test_alarms_are_kept_once_in_order_also_of_a_gateway_that_starts_again(tmp_path):
     assert alarms_of(tmp_path) == []
-    recorder = Recorder.open(tmp_path, "f")
     began = Alarm("gateway", 1, 5.0, "7d1f", "fault", "a is faulted.", "a", 5.0)
     seen = replace(began, number=2, time_s=6.0, by="ann", acknowledged="2026-01-31T09:00:00Z")
     again = Alarm("gateway", 1, 9.0, "8e2a", "sensor", "b has impossible temperatures.", "b", 9.0)
-    for alarm in (began, seen, seen, again, began):  # repeated ones are those that the next gateway publishes again
-        recorder.add("gateway", alarm)
-    recorder.write()
+    recorded(tmp_path, began, seen, seen, again, began)  # repeated ones: that the next gateway publishes again
     assert alarms_of(tmp_path) == list(open_messages(tmp_path)) == [began, seen, again]
