@@ -1,4 +1,4 @@
-"""The command line as a process of its own, forked from one that has imported it: that takes no seconds.
+"""The command line in this process, and as a process forked from one that has imported it: that takes no seconds.
 
 `start` and `run` serve tests of a command. What a start itself does (signals while it imports, variables that Python or
 MuJoCo read, a terminal) is tested with `REAL`, which starts Python.
@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 ROOT = Path(__file__).parents[1]
 REAL = (sys.executable, "-c", "from scenarios.cli.main import main; main()")
@@ -35,6 +35,34 @@ IMPORTED = (
 """Modules that commands import."""
 _LARGEST = 1 << 18
 """Bytes of a request."""
+
+
+class CommandResult(NamedTuple):
+    """Exit code and output of one call of the command line."""
+
+    code: int
+    out: str
+    err: str
+
+    def refused(self, sentence: str) -> bool:
+        """Whether the command ended with exit code 2 and this sentence, which may be wrapped."""
+        return self.code == 2 and sentence in " ".join(self.err.split())
+
+    def succeeded(self) -> "CommandResult":
+        """This result, of a command that must have ended with exit code 0."""
+        assert self.code == 0, self.err
+        return self
+
+
+def call(*words: object) -> int:
+    """Exit code of `thermofleet WORDS`, called in this process."""
+    from scenarios.cli.main import main
+
+    try:
+        main([str(word) for word in words])
+    except SystemExit as left:
+        return int(left.code or 0)
+    raise AssertionError("the command has not ended")
 
 
 def start_server() -> None:

@@ -29,7 +29,7 @@ from fleet.motion import RATE_HZ, Phase, Plan
 from fleet.robot import JOINTS, Robot, ThermalLimits
 from fleet.seeding import key_of
 from tests import profiles  # noqa: F401 -- loads the profile of Hypothesis
-from tests.commands import start_server
+from tests.commands import CommandResult, call, start_server
 
 # A shell starts background jobs with Ctrl-C ignored, and their child processes inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -297,6 +297,19 @@ def plans(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("THERMOFLEET_CACHE", str(folder))
         yield folder
+
+
+@pytest.fixture
+def thermofleet(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., CommandResult]:
+    """The command line: `thermofleet("run", path, "--seed", 3)`."""
+    # A stage that is slow on a slow machine prints a line of progress; what a command prints shall not depend on that.
+    monkeypatch.setattr("scenarios.terminal.AFTER_S", 1e6)
+
+    def result(*args: object) -> CommandResult:
+        code, output = call(*args), capsys.readouterr()
+        return CommandResult(code, output.out, output.err)
+
+    return result
 
 
 @pytest.fixture(scope="session")

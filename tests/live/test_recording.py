@@ -39,13 +39,13 @@ from fleet.errors import FleetError
 from fleet.events import Event
 from fleet.live.job_rules import EXPIRED
 from fleet.robot import ThermalLimits
-from scenarios.cli.main import main
 from scenarios.live.recorder import SWEEP_S, GapFetcher, Recorder, record
 from scenarios.live.recording import CARD, SOURCES, alarms_of, open_messages, read_card, read_parts, replay
 from scenarios.live.recording_report import NO_STATES, epochs_of, heat_use, open_recording, order_events
 from scenarios.result_folder import lock_folder
 from scenarios.run.records import JobRecord, ShiftLog, schedule
 from scenarios.show.run_page import late_jobs, lateness_text, report_html, verdict
+from tests.commands import call
 from tests.profiles import examples
 from tests.waiting import PATIENCE_S, serve_until, wait_until
 
@@ -741,13 +741,11 @@ def test_a_possible_log_is_left_as_it_is():
     assert schedule(order_events(LOG, ()), ARMS, 100.0) == schedule(LOG, ARMS, 100.0)
 
 
-def test_the_command_writes_the_page_into_the_recording_which_continues(tmp_path, capsys):
+def test_the_command_writes_the_page_into_the_recording_which_continues(tmp_path):
     for name in ("r", "s"):
         recorder = record_events(tmp_path / name, LOG)
         recorder.write()  # still going on
-        with pytest.raises(SystemExit) as code:
-            main(["report", str(tmp_path / name)])
-        assert code.value.code == 0
+        assert call("report", tmp_path / name) == 0
         assert "live recording" in (tmp_path / name / "report.html").read_text(encoding="utf-8")
         assert Recorder.open(tmp_path / name, recorder.fleet).parts == recorder.parts
     assert sorted(path.name for path in tmp_path.iterdir()) == ["r", "s"]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -19,7 +19,6 @@ from fleet.bus.router import Router
 from fleet.heat.motor import gen3_motors
 from fleet.heat.thermal import ThermalSpread, gen3_network, spread_motors, thermal_model
 from fleet.robot import Robot
-from scenarios.cli.main import main
 from scenarios.motion.generate import Verification, bare_arm
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.twins import cold_peaks, records
@@ -91,23 +90,6 @@ class Known:
         self.unit = max(hindsight - random, 0.1 * hindsight)
 
 
-class CommandResult(NamedTuple):
-    """Exit code and output of one call of the command line."""
-
-    code: int
-    out: str
-    err: str
-
-    def refused(self, sentence: str) -> bool:
-        """Whether the command ended with exit code 2 and this sentence, which may be wrapped."""
-        return self.code == 2 and sentence in " ".join(self.err.split())
-
-    def succeeded(self) -> "CommandResult":
-        """This result, of a command that must have ended with exit code 0."""
-        assert self.code == 0, self.err
-        return self
-
-
 @pytest.fixture(scope="session")
 def subject() -> SimpleNamespace:
     """An arm with its own deviation from a Gen3, light jobs that stay cool, and a small twin trained on them."""
@@ -156,22 +138,6 @@ def bad(tmp_path: Path) -> Path:
 def endpoint() -> Iterator[str]:
     with Router() as router:
         yield router.endpoint
-
-
-@pytest.fixture
-def thermofleet(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., CommandResult]:
-    """The command line: `thermofleet("run", path, "--seed", 3)`."""
-    # A stage that is slow on a slow machine prints a line of progress; what a command prints shall not depend on that.
-    monkeypatch.setattr("scenarios.terminal.AFTER_S", 1e6)
-
-    def call(*args: object) -> CommandResult:
-        with pytest.raises(SystemExit) as left:
-            main([str(arg) for arg in args])
-        output = capsys.readouterr()
-        assert isinstance(left.value.code, int)
-        return CommandResult(left.value.code, output.out, output.err)
-
-    return call
 
 
 class PressingCtrlC:

@@ -15,9 +15,9 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from scenarios.cli.main import main
 from scenarios.cli.twin import SHOWN_OF_LOG, doubts_of, network_of, subject_of
 from scenarios.prepare.twins import LOG_INPUT
+from tests.commands import call
 from tests.logs import RATE_HZ, logged
 from twin.vae.config import TwinConfig
 from twin.vae.measures import TAU
@@ -48,10 +48,7 @@ def logs(tmp_path_factory):
 @pytest.fixture(scope="session")
 def trained(logs, tmp_path_factory):
     out = tmp_path_factory.mktemp("trained") / "twins"
-    arguments = ["twin", "train", "--log", logs / "cool", *TINY, "--out", out]
-    with pytest.raises(SystemExit) as left:
-        main([str(argument) for argument in arguments])
-    assert left.value.code == 0
+    assert call("twin", "train", "--log", logs / "cool", *TINY, "--out", out) == 0
     return out
 
 

@@ -6,28 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenarios.cli.main import main
 from scenarios.run.log import RunLog, open_run
 from scenarios.show.film import Film
+from tests.commands import call
 
 
 @pytest.fixture(scope="session")
-def thermofleet() -> Callable[..., None]:
-    """The command line, called in place; it must succeed."""
-
-    def call(*args: object) -> None:
-        with pytest.raises(SystemExit) as ended:
-            main([str(arg) for arg in args])
-        assert ended.value.code in (0, None)
-
-    return call
-
-
-@pytest.fixture(scope="session")
-def run_folder(tmp_path_factory: pytest.TempPathFactory, thermofleet: Callable[..., None]) -> Path:
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("shift") / "run"
     options = ["--policy", "round_robin", "--seed", 11, "--difficulty", "blind", "--bus", "memory"]
-    thermofleet("run", "quickstart", *options, "--out", folder)
+    assert call("run", "quickstart", *options, "--out", folder) == 0
     return folder
 
 

@@ -14,15 +14,16 @@ from scipy.spatial.transform import Rotation, Slerp
 from scenarios.run.log import RunLog
 from scenarios.show.gltf import LONGEST_TURN_RAD, Z_UP, divided
 from scenarios.show.moments import motor_drums
+from tests.commands import call
 
 SPEED = 60.0
 NEAR_M = 1e-4
 
 
 @pytest.fixture(scope="module")
-def file(run_folder: Path, thermofleet, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def file(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("gltf") / "shift.glb"
-    thermofleet("view", run_folder, "--out", path, "--speed", SPEED)
+    assert call("view", run_folder, "--out", path, "--speed", SPEED) == 0
     return path
 
 

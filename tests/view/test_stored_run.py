@@ -19,7 +19,6 @@ import pytest
 from fleet.errors import FleetError
 from fleet.ros2.cdr import read, read_diagnostics, read_joints
 from fleet.telemetry import MODES, Telemetry
-from scenarios.cli.main import main
 from scenarios.run.log import RunLog, open_run, telemetry_table
 from scenarios.show.film import Film, Shot, times
 from scenarios.show.moments import Moments
@@ -114,28 +113,8 @@ def test_a_damaged_run_is_refused_in_words(run_folder: Path, tmp_path: Path, dam
         open_run(copied)
 
 
-def test_a_page_is_no_table_and_a_comparison_no_run(run_folder: Path, tmp_path: Path, capsys) -> None:
-    (tmp_path / "study").mkdir()
-    (tmp_path / "study" / "study.json").write_text("{}", encoding="utf-8")
-    (tmp_path / "fleet" / "recording").mkdir(parents=True)
-    (tmp_path / "fleet" / "fleet.json").write_text("{}", encoding="utf-8")
-    wrong = [
-        (["report", str(run_folder), "--out", str(tmp_path / name)], "--out must end in .html (got")
-        for name in ("r.csv", "r.xlsx", "r")
-    ]
-    wrong += [
-        (["report", str(tmp_path / "fleet")], "is of `thermofleet live`: give"),
-        (["report", str(tmp_path / "study")], "is of `thermofleet compare`: open its index.html in a browser."),
-    ]
-    for arguments, told in wrong:
-        with pytest.raises(SystemExit) as ended:
-            main(arguments)
-        assert ended.value.code == 2
-        assert told in " ".join(capsys.readouterr().err.split())
-
-
 def test_the_report_written_anew_is_the_same(run_folder: Path, tmp_path: Path, thermofleet) -> None:
-    thermofleet("report", run_folder, "--out", tmp_path / "again.html")
+    thermofleet("report", run_folder, "--out", tmp_path / "again.html").succeeded()
     assert (tmp_path / "again.html").read_bytes() == (run_folder / "report.html").read_bytes()
 
 
@@ -263,7 +242,7 @@ def test_an_mcap_file_has_the_shift_in_messages_of_ros_2(
     from mcap.reader import make_reader
 
     path = tmp_path / "shift.mcap"
-    thermofleet("view", run_folder, "--out", path, "--every", EVERY_S)
+    thermofleet("view", run_folder, "--out", path, "--every", EVERY_S).succeeded()
     messages: dict[str, list[tuple[float, object]]] = defaultdict(list)
     with path.open("rb") as stream:
         for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
@@ -311,61 +290,50 @@ def test_an_mcap_file_has_the_shift_in_messages_of_ros_2(
     assert [each.temperature for _, each in messages["/limits/error"]] == [run.scenario.limits.error_c] * 2
 
 
-@pytest.mark.parametrize(
-    ("options", "needed"),
-    [
-        (["--out", "shift.bag"], "--out must end in .mp4, .webm, .gif, .mcap, .glb (got 'shift.bag')"),
-        (["--out", "there.mcap"], "'there.mcap' exists; give another --out"),
-        (["--every", "5"], "--every is for --out FILE.mcap and FILE.glb"),
-        (["--out", "shift.mp4", "--size", "641x480"], "--size must be WIDTHxHEIGHT, even numbers"),
-        (["--out", "shift.mp4", "--speed", "0.1", "--fps", "60"], "Raise --speed"),
-        (["--out", "all.glb", "--end", "60"], "--end is for the viewer and films; .glb files hold the whole shift"),
-    ],
-)
-def test_a_file_that_cannot_be_is_refused(
-    run_folder: Path, tmp_path: Path, monkeypatch, capsys, options, needed
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "there.mcap").touch()
-    with pytest.raises(SystemExit) as ended:
-        main(["view", str(run_folder), *options])
-    assert ended.value.code == 2
-    assert needed in " ".join(capsys.readouterr().err.split())
-    assert [path.name for path in tmp_path.iterdir()] == ["there.mcap"]
+WRONG = {
+    "view RUN --out shift.bag": "--out must end in .mp4, .webm, .gif, .mcap, .glb (got 'shift.bag')",
+    "view RUN --out there.mcap": "'there.mcap' exists; give another --out",
+    "view RUN --every 5": "--every is for --out FILE.mcap and FILE.glb",
+    "view RUN --out shift.mp4 --size 641x480": "--size must be WIDTHxHEIGHT, even numbers",
+    "view RUN --out shift.mp4 --speed 0.1 --fps 60": "Raise --speed",
+    "view RUN --out all.glb --end 60": "--end is for the viewer and films; .glb files hold the whole shift",
+    "view RUN": "MuJoCo's viewer needs a display",
+    "view quickstart": "MuJoCo's viewer needs a display",
+    "view nowhere": "There is neither a folder nor a scenario 'nowhere'. Allowed: active_waiting,",
+    "view nowhere --out shift.glb": "There is neither a folder nor a scenario 'nowhere'.",
+    "view nowhere.toml": "There is no scenario file 'nowhere.toml'.",
+    "view quikstart": "nor a scenario 'quikstart'; did you mean 'quickstart'?",
+    "report RUN --out r.csv": "--out must end in .html (got",
+    "report RUN --out r": "--out must end in .html (got",
+    "report fleet": "is of `thermofleet live`: give",
+    "report study": "is of `thermofleet compare`: open its index.html in a browser.",
+    "report nowhere": "There is no folder 'nowhere'. Give the folder of a run or of a recording.",
+    "report nowhere --trace fault": "There is no folder 'nowhere'.",
+    "report RUN nowhere": "There is no folder 'nowhere'.",
+    "report RUN fleet": "must be of `thermofleet run`",
+    "report RUN RUN": "given twice",
+}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (["report", "nowhere"], "There is no folder 'nowhere'. Give the folder of a run or of a recording."),
-        (["report", "nowhere", "--trace", "fault"], "There is no folder 'nowhere'."),
-        (["report", "RUN", "nowhere"], "There is no folder 'nowhere'."),
-        (["view", "nowhere"], "There is neither a folder nor a scenario 'nowhere'. Allowed: active_waiting,"),
-        (["view", "quikstart"], "nor a scenario 'quikstart'; did you mean 'quickstart'?"),
-        (["view", "nowhere", "--out", "shift.glb"], "There is neither a folder nor a scenario 'nowhere'."),
-        (["view", "nowhere.toml"], "There is no scenario file 'nowhere.toml'."),
-        (["view", "quickstart"], "MuJoCo's viewer needs a display"),
-        (["view", "RUN"], "MuJoCo's viewer needs a display"),
-    ],
-)
-def test_a_folder_or_scenario_that_does_not_exist_is_named(
-    run_folder: Path, tmp_path: Path, monkeypatch, capsys, arguments, told
-) -> None:
+@pytest.mark.parametrize("words", WRONG)
+def test_what_cannot_be_shown_is_refused_in_a_sentence(run_folder, tmp_path, monkeypatch, thermofleet, words) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    with pytest.raises(SystemExit) as ended:
-        main([str(run_folder) if each == "RUN" else each for each in arguments])
-    assert ended.value.code == 2
-    assert told in " ".join(capsys.readouterr().err.split())
+    (tmp_path / "fleet" / "recording").mkdir(parents=True)
+    (tmp_path / "study").mkdir()
+    for file in ("there.mcap", "fleet/fleet.json", "study/study.json"):
+        (tmp_path / file).touch()
+    assert thermofleet(*(run_folder if word == "RUN" else word for word in words.split())).refused(WRONG[words])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fleet", "study", "there.mcap"]
 
 
-def test_runs_side_by_side_are_one_page_and_one_table(run_folder: Path, thermofleet, tmp_path: Path, capsys) -> None:
+def test_runs_side_by_side_are_one_page_and_one_table(run_folder: Path, thermofleet, tmp_path: Path) -> None:
     openpyxl = pytest.importorskip("openpyxl")
     again = shutil.copytree(run_folder, tmp_path / "again")
     for ending in ("html", "csv", "xlsx"):
-        thermofleet("report", run_folder, again, "--out", tmp_path / f"two.{ending}")
+        thermofleet("report", run_folder, again, "--out", tmp_path / f"two.{ending}").succeeded()
     page = (tmp_path / "two.html").read_text(encoding="utf-8")
     assert "2 runs of quickstart" in page
     assert "The runs differ in nothing. All have the same jobs." in page
@@ -376,7 +344,3 @@ def test_runs_side_by_side_are_one_page_and_one_table(run_folder: Path, thermofl
     metrics = open_run(run_folder).metrics
     assert cells["jobs finished"] == (metrics.finished, metrics.finished, 0)
     assert ["jobs finished", str(metrics.finished), str(metrics.finished), "0"] in lines
-    for wrong, told in ((tmp_path, "must be of `thermofleet run`"), (run_folder, "given twice")):
-        with pytest.raises(SystemExit):
-            main(["report", str(run_folder), str(wrong)])
-        assert told in capsys.readouterr().err
