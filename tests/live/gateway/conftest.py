@@ -1,8 +1,9 @@
-"""A gateway, and the fleet of one arm behind it."""
+"""A gateway with its page, and the fleet of one arm behind it."""
 
 import pytest
 
 from fleet.bus.router import Router
+from scenarios.live.gateway import LivePage
 from tests.live.gateway.moving_fleet import MovingFleet
 from tests.live.gateway.served import Served
 
@@ -24,5 +25,5 @@ def arm(router):
 
 @pytest.fixture(scope="module")
 def gateway(router, arm):
-    with Served(router) as served:
+    with Served(router, page=LivePage()) as served:
         yield served

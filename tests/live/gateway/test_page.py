@@ -42,34 +42,15 @@ WATCHER, SENDER, BOSS = "watcher-watcher-watcher", "sender-sender-sender", "oper
 
 
 @pytest.fixture(scope="module")
-def page_router():
-    with Router() as opened:
-        yield opened.endpoint
-
-
-@pytest.fixture(scope="module")
-def moving(page_router):
-    with MovingFleet(page_router, ("arm_0", "arm_1"), fleet="f") as moving:
-        yield moving
-
-
-@pytest.fixture(scope="module")
-def served(page_router, moving):
-    with Served(page_router, page=LivePage()) as opened:
+def guarded(router, arm):
+    tokens = {WATCHER: "monitor", SENDER: "submitter", BOSS: "operator"}
+    with Served(router, page=LivePage(), tokens=tokens) as opened:
         yield opened
 
 
-@pytest.fixture(scope="module")
-def guarded(page_router, moving):
-    with Served(
-        page_router, page=LivePage(), tokens={WATCHER: "monitor", SENDER: "submitter", BOSS: "operator"}
-    ) as opened:
-        yield opened
-
-
-def get(served, path, headers=(), method="GET"):
+def get(gateway, path, headers=(), method="GET"):
     """Status, headers and text of an answer."""
-    line = http.client.HTTPConnection("127.0.0.1", served.port, timeout=PATIENCE_S)
+    line = http.client.HTTPConnection("127.0.0.1", gateway.port, timeout=PATIENCE_S)
     try:
         line.request(method, path, headers=dict(headers))
         answer = line.getresponse()
@@ -80,9 +61,9 @@ def get(served, path, headers=(), method="GET"):
         line.close()
 
 
-def test_browsers_get_a_page_that_may_load_nothing_from_elsewhere_and_run_no_inline_script(served):
-    assert get(served, "/")[1].get_content_type() == "application/json"  # for programs
-    status, headers, text = get(served, "/", BROWSER)
+def test_browsers_get_a_page_that_may_load_nothing_from_elsewhere_and_run_no_inline_script(gateway):
+    assert get(gateway, "/")[1].get_content_type() == "application/json"  # for programs
+    status, headers, text = get(gateway, "/", BROWSER)
     assert (status, headers.get_content_type(), 'id="cell"' in text) == (200, "text/html", True)
     rules = dict(rule.strip().split(" ", 1) for rule in headers["Content-Security-Policy"].split(";"))
     assert rules["default-src"] == rules["form-action"] == rules["frame-ancestors"] == rules["base-uri"] == "'none'"
@@ -93,14 +74,14 @@ def test_browsers_get_a_page_that_may_load_nothing_from_elsewhere_and_run_no_inl
     assert not re.search(r"<[^>]*\son\w+=", text)
     assert all(part.startswith(' src="/page/') for part in text.split("<script")[1:])
     for name in (*FILES, "three.js"):
-        status, headers, text = get(served, f"/page/{name}")
+        status, headers, text = get(gateway, f"/page/{name}")
         assert (status, headers["X-Content-Type-Options"]) == (200, "nosniff"), name
         assert len(text) > 500
         assert "innerHTML" not in text or name == "three.js"
 
 
-def test_without_the_page_the_gateway_serves_no_html(page_router, moving):
-    with Served(page_router) as plain:
+def test_without_the_page_the_gateway_serves_no_html(router, arm):
+    with Served(router) as plain:
         assert get(plain, "/", BROWSER)[1].get_content_type() == "application/json"
         assert get(plain, "/page/cell.js")[0] == 404
 
@@ -120,11 +101,11 @@ def test_the_page_needs_no_token_and_everything_about_the_fleet_does(guarded):
     assert get(guarded, "/page/cell.js", method="POST")[0] == 401
 
 
-def test_the_scene_is_the_cell_that_the_auctioneer_describes(served, moving):
-    _, _, text = get(served, "/v4/scene")
-    scene, cell = json.loads(text), moving.cell()
-    assert [(arm["name"], tuple(arm["position"])) for arm in scene["arms"]] == [
-        (arm.name, arm.position_m) for arm in cell.arms
+def test_the_scene_is_the_cell_that_the_auctioneer_describes(gateway, arm):
+    _, _, text = get(gateway, "/v4/scene")
+    scene, cell = json.loads(text), arm.cell()
+    assert [(each["name"], tuple(each["position"])) for each in scene["arms"]] == [
+        (each.name, each.position_m) for each in cell.arms
     ]
     assert [place["name"] for place in scene["places"]] == [place.name for place in cell.places]
     assert (scene["heat"]["warning_c"], scene["heat"]["error_c"]) == (cell.warning_c, cell.error_c)
@@ -158,30 +139,30 @@ def test_a_pause_is_seen_when_it_is_requested_and_not_when_it_is_history():
     assert paused(Resume("*"), 8.0) == {}
 
 
-def test_a_fault_is_reset_over_http(served, moving):
-    moving.mode["arm_1"] = "faulted"
+def test_a_fault_is_reset_over_http(gateway, arm):
+    arm.mode["a+1"] = "faulted"
     token = ("POST", "/v4/reset")
-    assert served.ask(*token, {"arm": "arm_1", "by": "ann"})[2] == {"arm": "arm_1", "changed": True}
-    assert moving.requests[-1] == ResetRequest("ann")
-    assert served.ask(*token, {"arm": "arm_1"})[2]["changed"] is False
-    status, _, told = served.ask(*token, {"arm": "nobody"})
+    assert gateway.ask(*token, {"arm": "a+1", "by": "ann"})[2] == {"arm": "a+1", "changed": True}
+    assert arm.requests[-1] == ResetRequest("ann")
+    assert gateway.ask(*token, {"arm": "a+1"})[2]["changed"] is False
+    status, _, told = gateway.ask(*token, {"arm": "nobody"})
     assert status == 404
-    assert told["detail"].startswith("There is no arm 'nobody'. Arms: arm_0, arm_1")
-    assert served.ask(*token, {"arm": "a/b"})[0] == 422
+    assert told["detail"].startswith("There is no arm 'nobody'. Arms: a+1")
+    assert gateway.ask(*token, {"arm": "a/b"})[0] == 422
 
 
-def test_the_snapshot_names_the_paused_arms_and_as_many_jobs_as_asked_for(served, moving):
+def test_the_snapshot_names_the_paused_arms_and_as_many_jobs_as_asked_for(gateway, arm):
     jobs = [
         {"name": f"crate {number}", "kind": "hold", "places": ["clamp"], "repetitions": 1000} for number in (1, 2, 3)
     ]
-    assert served.ask("POST", "/v4/jobs", {"jobs": jobs})[0] == 200
-    pause = {"request": "p1", "action": {"action": "pause", "arm": "arm_0"}, "by": "ann"}
-    assert served.ask("POST", "/v4/control", pause)[2]["changed"] is True
-    assert moving.requests[-1] == ControlRequest("p1", Pause("arm_0"), "ann")
-    told = wait_until(lambda: (snapshot := served.ask("GET", "/v4/fleet?jobs=1")[2])["paused"] and snapshot)
-    assert told["paused"] == {"arm_0": "ann"}
+    assert gateway.ask("POST", "/v4/jobs", {"jobs": jobs})[0] == 200
+    pause = {"request": "p1", "action": {"action": "pause", "arm": "a+1"}, "by": "ann"}
+    assert gateway.ask("POST", "/v4/control", pause)[2]["changed"] is True
+    assert arm.requests[-1] == ControlRequest("p1", Pause("a+1"), "ann")
+    told = wait_until(lambda: (snapshot := gateway.ask("GET", "/v4/fleet?jobs=1")[2])["paused"].get("a+1") and snapshot)
+    assert told["paused"] == {"*": "ann", "a+1": "ann"}
     assert len(told["jobs"]) == 1
-    served.ask("POST", "/v4/control", {"request": "p2", "action": {"action": "resume", "arm": "arm_0"}})
+    gateway.ask("POST", "/v4/control", {"request": "p2", "action": {"action": "resume", "arm": "a+1"}})
 
 
 def test_up_starts_the_page_with_the_certificate_of_an_operator(tmp_path):
@@ -198,7 +179,7 @@ def test_the_fleet_is_shown_with_ages(gateway, arm):
         _, kind, snapshot = gateway.ask("GET", "/v4/fleet")
         assert kind == "application/json"
         present = snapshot["arms"] and snapshot["arms"][0]["present"]
-        return snapshot if present and snapshot["counts"] == {"waiting": 1} else None
+        return snapshot if present and snapshot["counts"].get("waiting") else None
 
     snapshot = wait_until(fleet)
     assert snapshot["fleet"] == "f"
@@ -382,7 +363,7 @@ def test_a_token_may_do_what_its_role_may(guarded):
     status, _, told = ask(WATCHER, "POST", "/v4/jobs", {"jobs": [CRATE_JSON]})
     assert (status, told["detail"]) == (403, "This token has the role monitor; this request needs submitter.")
     assert ask(SENDER, "POST", "/v4/jobs", {"jobs": [CRATE_JSON]})[0] == 200
-    for path, body in (("control", PAUSE), ("reset", {"arm": "arm_0"})):
+    for path, body in (("control", PAUSE), ("reset", {"arm": "a+1"})):
         status, _, told = ask(SENDER, "POST", f"/v4/{path}", body)
         assert (status, told["detail"]) == (403, "This token has the role submitter; this request needs operator.")
 
@@ -401,18 +382,18 @@ def test_no_other_origin_is_ever_allowed(gateway):
     assert not [name for name in headers if name.lower().startswith("access-control")]
 
 
-def test_the_page_may_send_requests_and_be_linked_to_from_anywhere(served):
-    own = f"http://127.0.0.1:{served.port}"
+def test_the_page_may_send_requests_and_be_linked_to_from_anywhere(gateway):
+    own = f"http://127.0.0.1:{gateway.port}"
     proxied = {"Origin": "https://fleet.example", "Sec-Fetch-Site": "same-origin"}
     for headers in ({"Origin": own}, {"Origin": own, "Sec-Fetch-Site": "same-origin"}, proxied):
-        assert get(served, "/v4/fleet", headers)[0] == 200, headers
-    assert get(served, "/", {**BROWSER, "Sec-Fetch-Site": "cross-site"})[0] == 200
-    assert get(served, "/v4/fleet", {"Sec-Fetch-Site": "cross-site"})[0] == 403
+        assert get(gateway, "/v4/fleet", headers)[0] == 200, headers
+    assert get(gateway, "/", {**BROWSER, "Sec-Fetch-Site": "cross-site"})[0] == 200
+    assert get(gateway, "/v4/fleet", {"Sec-Fetch-Site": "cross-site"})[0] == 403
 
 
-def test_a_file_of_the_page_is_compressed_if_the_request_accepts_that(served):
+def test_a_file_of_the_page_is_compressed_if_the_request_accepts_that(gateway):
     for accepts, coding in (("identity", None), ("gzip, br", "gzip")):
-        _, headers, text = get(served, "/page/cell.js", {"Accept-Encoding": accepts})
+        _, headers, text = get(gateway, "/page/cell.js", {"Accept-Encoding": accepts})
         assert (headers["Content-Encoding"], headers["Vary"]) == (coding, "Accept, Accept-Encoding")
         assert len(text) > 500
 
