@@ -3,9 +3,10 @@
 import io
 import shutil
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,17 +50,41 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture
-def page(browser: Browser, run_folder: Path) -> Iterator[Page]:
-    """The report of the shared run; nothing may be requested, and nothing may fail."""
-    page, said = browser.new_page(viewport={"width": 1200, "height": 900}), []
-    page.on("console", lambda message: said.append(message.text) if message.type in ("error", "warning") else None)
-    page.on("pageerror", lambda error: said.append(str(error)))
-    page.on("request", lambda request: said.append(request.url) if not request.url.startswith("file:") else None)
-    page.goto((run_folder / "report.html").as_uri())
-    page.wait_for_selector("body[data-ready]", timeout=300_000)
-    yield page
-    page.close()
+def open_page(browser: Browser, tmp_path: Path) -> Iterator[Callable[..., Page]]:
+    """Opens a text or a file in a page; nothing may be requested, and nothing may fail."""
+    opened, said = list[Page](), list[str]()
+
+    def show(content: str | Path, ready: str = "body[data-ready]", **options: Any) -> Page:
+        if isinstance(content, str):
+            (tmp_path / "page.html").write_text(content, encoding="utf-8")
+            content = tmp_path / "page.html"
+        page = browser.new_page(**options)
+        page.on("console", lambda message: said.append(message.text) if message.type in ("error", "warning") else None)
+        page.on("pageerror", lambda error: said.append(str(error)))
+        page.on("request", lambda request: said.append(request.url) if not request.url.startswith("file:") else None)
+        page.goto(content.as_uri())
+        page.wait_for_selector(ready, timeout=300_000)
+        opened.append(page)
+        return page
+
+    yield show
+    for page in opened:
+        page.close()
     assert [line for line in said if "GL Driver Message" not in line] == []
+
+
+@pytest.fixture
+def page(open_page: Callable[..., Page], run_folder: Path) -> Page:
+    """The report of the shared run."""
+    return open_page(run_folder / "report.html", viewport={"width": 1200, "height": 900})
+
+
+NARROW = {"width": 390, "height": 850}
+
+
+def overflow_px(page: Page) -> int:
+    """How much wider the page is than the window."""
+    return page.locator("html").evaluate("e => e.scrollWidth - e.clientWidth")
 
 
 def canvas(page: Page) -> np.ndarray:
@@ -119,12 +144,9 @@ def test_the_keyboard_plays_and_turns(page: Page) -> None:
 
 
 @pytest.mark.parametrize("width", [390, 1200])
-def test_two_shifts_play_in_step(browser: Browser, run: RunLog, tmp_path: Path, width: int) -> None:
+def test_two_shifts_play_in_step(open_page, run: RunLog, width: int) -> None:
     text = runs_page({name: replace(run) for name in ("one", "other")}, model=run.cell_model())
-    (tmp_path / "index.html").write_text(text, encoding="utf-8")
-    page = browser.new_page(viewport={"width": width, "height": 900})
-    page.goto((tmp_path / "index.html").as_uri())
-    page.wait_for_selector("body[data-ready]", timeout=300_000)
+    page = open_page(text, viewport={"width": width, "height": 900})
     page.locator("#time").fill("3600")
     page.locator("#time").dispatch_event("input")
     one, other = page.locator(".now").all_inner_texts()
@@ -140,15 +162,12 @@ def test_two_shifts_play_in_step(browser: Browser, run: RunLog, tmp_path: Path, 
     assert side_by_side == (width > 800)
     for box, scale in zip(boxes, page.locator(".cell .scale").all(), strict=True):
         assert scale.bounding_box()["y"] >= box["y"] + box["height"]  # pyright: ignore[reportOptionalSubscript]
-    assert page.locator("html").evaluate("e => e.scrollWidth - e.clientWidth") <= 0
-    page.close()
+    assert overflow_px(page) <= 0
 
 
 @pytest.mark.ci_slow
-def test_a_narrow_page_overprints_nothing(page: Page) -> None:
-    page.set_viewport_size({"width": 390, "height": 850})
-    page.reload()
-    page.wait_for_selector("body[data-ready]", timeout=300_000)
+def test_a_narrow_page_overprints_nothing(open_page, run_folder: Path) -> None:
+    page = open_page(run_folder / "report.html", viewport=NARROW)
     page.wait_for_timeout(500)
     assert page.locator(".chart").count() == 2
     for chart in page.locator(".chart").all():
@@ -156,38 +175,28 @@ def test_a_narrow_page_overprints_nothing(page: Page) -> None:
         assert legend is not None
         assert plot is not None
         assert legend["y"] + legend["height"] <= plot["y"] + 1
-    overflow = page.locator("html").evaluate("e => e.scrollWidth - e.clientWidth")
-    assert overflow <= 0
+    assert overflow_px(page) <= 0
 
 
-def test_a_narrow_table_breaks_no_short_word_and_scrolls_in_its_box(browser: Browser) -> None:
-    words = (
-        "rush_hold_part-006",
-        "2:05:09",
-        "54 min 51 s",
-        "finished",
-        "14 other jobs went first on arm_1, 13 shorter",
-    )
+def test_a_narrow_table_breaks_no_short_word_and_scrolls_in_its_box(open_page) -> None:
+    why = "14 other jobs went first on arm_1, 13 shorter"
+    words = ("rush_hold_part-006", "2:05:09", "54 min 51 s", "finished", why)
     table = Table(head=("job", "due", "late by", "state", "why"), rows=(words,), numbers=False)
-    page = browser.new_page(viewport={"width": 390, "height": 850})
-    page.set_content(Report(title="a", sections=[Section(tables=(table,))]).html())
+    page = open_page(Report(title="a", sections=[Section(tables=(table,))]).html(), "table", viewport=NARROW)
     for word in ("2:05:09", "finished"):
         height_px = page.get_by_role("cell", name=word).evaluate(HEIGHT_OF_TEXT)
         assert height_px < 30, word  # one line
-    assert page.locator("html").evaluate("e => e.scrollWidth - e.clientWidth") <= 0
-    page.close()
+    assert overflow_px(page) <= 0
 
 
-def test_a_narrow_table_of_figures_keeps_the_names_of_its_rows_and_tiles_wrap(browser: Browser) -> None:
+def test_a_narrow_table_of_figures_keeps_the_names_of_its_rows_and_tiles_wrap(open_page) -> None:
     rows = (("predictions", *["0.123 to 0.456"] * 6),)
     table = Table(head=("", *("hottest", "coolest") * 3), rows=rows)
-    page = browser.new_page(viewport={"width": 390, "height": 850})
     head = Head(tiles=(("hottest motor", f"70 °C {'x' * 54}", ""),))
-    page.set_content(Report(title="a", sections=[Section(tables=(table,))], head=head).html())
-    page.wait_for_selector(".figures dd")
+    report = Report(title="a", sections=[Section(tables=(table,))], head=head)
+    page = open_page(report.html(), ".figures dd", viewport=NARROW)
     assert page.get_by_role("cell", name="predictions").evaluate(HEIGHT_OF_TEXT) < 30  # one line
-    assert page.locator("html").evaluate("e => e.scrollWidth - e.clientWidth") <= 0
-    page.close()
+    assert overflow_px(page) <= 0
 
 
 def luminance(rgb: np.ndarray) -> np.ndarray:
@@ -197,11 +206,9 @@ def luminance(rgb: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.ci_slow
-def test_words_have_contrast_in_light_and_dark(browser: Browser, run_folder: Path) -> None:
+def test_words_have_contrast_in_light_and_dark(open_page, run_folder: Path) -> None:
     for scheme in ("light", "dark"):
-        page = browser.new_page(color_scheme=scheme)  # pyright: ignore[reportArgumentType]
-        page.goto((run_folder / "report.html").as_uri())
-        page.wait_for_selector("body[data-ready]", timeout=300_000)
+        page = open_page(run_folder / "report.html", color_scheme=scheme)
         for selector in ("h1", ".verdict", ".faint", ".status", "#events td", ".chart .ytick text"):
             colours = page.locator(selector).first.evaluate(COLOURS)
             ink, paper = (
@@ -209,21 +216,16 @@ def test_words_have_contrast_in_light_and_dark(browser: Browser, run_folder: Pat
             )
             bright, dim = max(ink, paper), min(ink, paper)
             assert (bright + 0.05) / (dim + 0.05) >= 4.5, (scheme, selector, colours)
-        page.close()
 
 
-def test_a_moved_and_turned_arm_reaches_what_the_lines_to_paste_say(browser: Browser, tmp_path: Path) -> None:
+def test_a_moved_and_turned_arm_reaches_what_the_lines_to_paste_say(open_page) -> None:
     """`shoulder_m` of the changed arms tells the distance that places lack; the arm hangs at a wall."""
     first, *_ = load("quickstart").arms
     scenario = replace(load("quickstart"), arms=(replace(first, tilt_deg=(90.0, 10.0, 170.0)),))
     empty = {"exclusions": (), "at_once": (), "problems": ()}
     near = Reach(arm=first.name, place="belt", payload_kg=None, lacks_m=0.0)  # within reach, but not with this tool
     report = LayoutReport(scenario="a", clearance_m=0.0, reach=(near,), excluded_share=0.0, largest=True, **empty)
-    (tmp_path / "cell.html").write_text(plan_page(scenario, report), encoding="utf-8")
-    page, failed = browser.new_page(), []
-    page.on("pageerror", lambda error: failed.append(str(error)))
-    page.goto((tmp_path / "cell.html").as_uri())
-    page.wait_for_selector("body[data-ready]")
+    page = open_page(plan_page(scenario, report))
     assert page.locator("#changes").input_value() == ""
     assert page.locator('[data-place="belt"] text').text_content() == "belt: no arm can work here"
     assert page.locator(".arm.unable .name").text_content() == "arm_0: can do no job"
@@ -246,5 +248,3 @@ def test_a_moved_and_turned_arm_reaches_what_the_lines_to_paste_say(browser: Bro
     assert set(told) == expected
     for name, text in told.items():
         assert float(text.split(" lacks ")[1].split()[0]) == pytest.approx(lacks_m[name], abs=0.011)
-    page.close()
-    assert failed == []
