@@ -24,5 +24,20 @@ def logged(name: str, *, load: float = 1.0, celsius: float = 31.0, seed: int = 0
     return Recording(name=name, time_s=time_s, q=q, qd=np.gradient(q, time_s, axis=0), tau=tau, temp_c=temp_c)
 
 
+def columns_of(log: Recording) -> dict[str, np.ndarray]:
+    """Columns of a plain log (docs/logs.md)."""
+    columns = {"time_s": log.time_s}
+    for name in ("q", "qd", "tau", "temp_c"):
+        columns |= {f"{name}_{j}": column for j, column in enumerate(getattr(log, name).T, start=1)}
+    return columns
+
+
+def csv_of(log: Recording, form: str = "") -> str:
+    """A plain log; `form` of its numbers, by default with all digits."""
+    columns = columns_of(log)
+    rows = (",".join(format(value, form) for value in row) for row in np.stack([*columns.values()], axis=1).tolist())
+    return "\n".join([",".join(columns), *rows]) + "\n"
+
+
 COOL = [logged(f"cool_{i}", seed=i) for i in range(14)]
 WARM = logged("warm", celsius=45.0, seed=90)

@@ -7,7 +7,7 @@ import pytest
 
 from fleet.errors import FleetError
 from scenarios.prepare.twins import train_log
-from tests.logs import COOL, RATE_HZ, TINY, WARM, logged
+from tests.logs import COOL, RATE_HZ, TINY, WARM, csv_of, logged
 from twin.logs.recording import cool_stretches
 from twin.vae.config import hash_records
 from twin.verdict import log_features
@@ -37,12 +37,8 @@ def folder(tmp_path_factory):
     where = tmp_path_factory.mktemp("verdict")
     (where / "logs").mkdir()
     for r in [*COOL, logged("heavy", load=3.0, seed=91)]:
-        assert r.temp_c is not None
-        columns = {"time_s": r.time_s[:, None], "q": r.q, "qd": r.qd, "tau": r.tau, "temp_c": r.temp_c}
-        head = ["time_s", *(f"{name}_{j}" for name in list(columns)[1:] for j in range(1, 8))]
-        rows = "\n".join(",".join(f"{v:.6f}" for v in row) for row in np.hstack(list(columns.values())))
         place = where / ("heavy.csv" if r.name == "heavy" else f"logs/{r.name}.csv")
-        place.write_text(",".join(head) + "\n" + rows + "\n", encoding="utf-8")
+        place.write_text(csv_of(r, ".6f"), encoding="utf-8")
     return where
 
 

@@ -18,7 +18,7 @@ import pytest
 from scenarios.cli.twin import SHOWN_OF_LOG, doubts_of, network_of, subject_of
 from scenarios.prepare.twins import LOG_INPUT
 from tests.commands import call
-from tests.logs import RATE_HZ, logged
+from tests.logs import RATE_HZ, columns_of, csv_of, logged
 from twin.vae.config import TwinConfig
 from twin.vae.measures import TAU
 from twin.vae.twin import load
@@ -30,9 +30,7 @@ def log_csv(seconds: float, *, celsius: float, load: float = 1.0, seed: int = 0,
     """`tests.logs.logged` as a plain log; joint 2 may warm."""
     log = logged("log", load=load, celsius=celsius, seed=seed, seconds=seconds)
     log.temp_c[:, 1] += warms_k * (1 - np.exp(-log.time_s / 300))
-    head = ["time_s", *(f"{name}_{j}" for name in ("q", "qd", "tau", "temp_c") for j in range(1, 8))]
-    rows = np.hstack([log.time_s[:, None], log.q, log.qd, log.tau, log.temp_c])
-    return "\n".join([",".join(head), *(",".join(f"{v:.6f}" for v in row) for row in rows)]) + "\n"
+    return csv_of(log, ".6f")
 
 
 @pytest.fixture(scope="session")
@@ -296,26 +294,19 @@ def test_a_forecast_follows_from_a_log_and_a_plan(thermofleet, small_toml, tmp_p
 
 def test_one_arm_of_a_log_of_several_is_chosen_by_its_name(thermofleet, tmp_path):
     """The twin and the network of an arm are those of a log of this arm alone."""
-    logs = {name: logged(name, seed=seed, seconds=400.0) for name, seed in (("left", 1), ("right", 2))}
-    names = [f"{channel}_{j}" for channel in ("q", "qd", "tau", "temp_c") for j in range(1, 8)]
-    columns = {
-        name: np.hstack([log.time_s[:, None], log.q, log.qd, log.tau, log.temp_c + 0.01 * log.time_s[:, None]])
-        for name, log in logs.items()
-    }
-    both = {"arm": np.repeat(list(logs), len(logs["left"].time_s)).tolist()}
-    both |= {each: np.concatenate([c[:, i] for c in columns.values()]) for i, each in enumerate(["time_s", *names])}
+    logs = [logged(name, seed=seed, seconds=400.0) for name, seed in (("left", 1), ("right", 2))]
+    for log in logs:
+        log.temp_c[:] += 0.01 * log.time_s[:, None]
+    both = pa.concat_tables(pa.table({"arm": [log.name] * len(log.time_s), **columns_of(log)}) for log in logs)
     path, alone = tmp_path / "telemetry.parquet", tmp_path / "alone" / "telemetry.parquet"
     alone.parent.mkdir()
-    pq.write_table(pa.table(both), path)
-    pq.write_table(pa.table(both).filter(pc.field("arm") == "right"), alone)
+    pq.write_table(both, path)
+    pq.write_table(both.filter(pc.field("arm") == "right"), alone)
     cards = {}
     for log, arm in ((path, ("--arm", "right")), (alone, ())):
-        said = thermofleet(
-            "twin", "train", "--log", log, *arm, *TINY, "--out", log.parent / "twins", "--json"
-        ).succeeded()
-        (twin,) = json.loads(said.out)["twins"]
-        identified = thermofleet("twin", "identify", "--log", log, *arm, "--json").succeeded()
-        network = json.loads(identified.out)
+        train = ("twin", "train", "--log", log, *arm, *TINY, "--out", log.parent / "twins", "--json")
+        (twin,) = json.loads(thermofleet(*train).succeeded().out)["twins"]
+        network = json.loads(thermofleet("twin", "identify", "--log", log, *arm, "--json").succeeded().out)
         cards[log] = twin["arm"], twin["data_hash"], network["arm"], network["data_hash"]
     assert cards[path] == cards[alone]
     assert cards[path][::2] == ("right", "right")

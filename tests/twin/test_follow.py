@@ -10,17 +10,11 @@ import pytest
 from fleet.errors import LogError
 from scenarios.show.twin_scores import score_windows, window_rows
 from tests.commands import start
+from tests.logs import csv_of
 from twin.log_windows import WindowFeed
 from twin.logs.reader import Damaged, GrowingLog, read
 from twin.logs.recording import Recording
 from twin.vae.twin import save
-
-
-def csv_of(log: Recording) -> str:
-    assert log.temp_c is not None
-    head = ["time_s", *(f"{name}_{j}" for name in ("q", "qd", "tau", "temp_c") for j in range(1, 8))]
-    rows = np.hstack([log.time_s[:, None], log.q, log.qd, log.tau, log.temp_c])
-    return "\n".join([",".join(head), *(",".join(repr(v) for v in row) for row in rows.tolist())]) + "\n"
 
 
 def log_of(motion, *, rate_hz: float = 10.0, jitter: float = 0.2, seconds: float = 30.0) -> Recording:
