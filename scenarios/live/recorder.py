@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -158,21 +159,16 @@ class Recorder:
         """Number of rows that are in no part yet."""
         return len(self._rows)
 
-    def add(self, sender: str, message: Message) -> None:
-        """Keep a message, unless it was kept before or memory is full."""
-        if self.waiting < MAX_WAITING and self._take(message):
-            self._rows.append(message)
-
-    def add_unnumbered(self, sender: str, message: Message) -> None:
-        """Keep an operation of an arm, unless it was kept before or memory is full."""
-        assert isinstance(message, Operation), "all other messages have numbers"
-        if self.waiting < MAX_WAITING and self._take_unnumbered(message):
+    def add(self, _: str, message: Message, *, numbered: bool = True) -> None:
+        """Keep a message, unless it was kept before or memory is full; all but the operations of arms have numbers."""
+        take = self._take if numbered else self._take_unnumbered
+        if self.waiting < MAX_WAITING and take(message):
             self._rows.append(message)
 
     def subscribe(self, link: BusClient, source: Source, name: str | None = None) -> None:
         """Subscribe to the messages of a sender, or of all by default, with those that are cached."""
         key = keys.build(link.fleet, source.role, source.topic, name)
-        link.subscribe(key, source.message, self.add if source.numbered else self.add_unnumbered, history=True)
+        link.subscribe(key, source.message, partial(self.add, numbered=source.numbered), history=True)
 
     def abandon(self, gap: Gap, reason: str) -> None:
         """Fetch a gap no more: it becomes a row."""
@@ -241,8 +237,9 @@ class Recorder:
         count.time_s = time_s if begins or restarted else max(count.time_s, time_s)
         return True
 
-    def _take_unnumbered(self, operation: Operation) -> bool:
+    def _take_unnumbered(self, operation: Message) -> bool:
         """Count an operation of an arm; return whether it is new."""
+        assert isinstance(operation, Operation), "all other messages have numbers"
         count = self.counts.setdefault(f"operations of {operation.auctioneer}", SenderCount())
         request = operation.time_s, operation.request.request
         if request in count.requests:

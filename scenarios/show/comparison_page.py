@@ -1,7 +1,7 @@
 """A comparison as text, and as one HTML file that opens offline: verdict, intervals, charts and its command."""
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any  # values of a card, and of Plotly's schema
@@ -300,13 +300,22 @@ def _score_charts(judged: Judged) -> list[Chart]:
     chosen = order[:MOST_CURVES]
     if judged.baseline not in chosen:
         chosen = [*chosen[:-1], judged.baseline]
-    bands = {label(name): profile(values.score[name], THRESHOLDS, groups=values.groups) for name in chosen}
-    share = "share of instances above"
-    profiles = lines(THRESHOLDS, bands, {label(chosen[0]), base}, judged.numbers, "normalised score", share)
+    bands, curves, share = list[Trace](), list[Trace](), "share of instances above"
+    for name in chosen:
+        value, low, high = profile(values.score[name], THRESHOLDS, groups=values.groups)
+        look = charts.look_of(judged.numbers[label(name)])
+        if name in (chosen[0], judged.baseline):
+            bands.append(charts.band(THRESHOLDS, low, high, look["color"], showlegend=False))
+        curves.append(charts.curve(plain(label(name), NAME), THRESHOLDS, value, look))
+    axes = {
+        "xaxis": axis("normalised score", range=THRESHOLDS[[0, -1]].tolist()),
+        "yaxis": axis(share, range=[0, 1.02]),
+    }
+    profiles = {"data": [*bands, *curves], "layout": charts.WITH_LEGEND | axes}
     numbers = ", ".join(f"{name} {value:.2f}" for name, value, _, _ in rows)
     return [
         Chart(key="means", figure=means_figure, alt=f"mean normalised score: {numbers}"),
-        Chart(key="profiles", figure=profiles, alt=f"{share} each normalised score of {', '.join(bands)}"),
+        Chart(key="profiles", figure=profiles, alt=f"{share} each normalised score of {', '.join(map(label, chosen))}"),
     ]
 
 
@@ -394,33 +403,6 @@ def spans(
         | {"annotations": cut, "showlegend": False}
         | {"xaxis": axis(title, range=[begin, high + room]), "yaxis": charts.named_rows(labels)},
     }
-
-
-def lines(
-    x_values: Array,
-    by_name: Mapping[str, tuple[Array, Array, Array]],
-    banded: Collection[str],
-    numbers: Mapping[str, int],
-    x_title: str,
-    y_title: str,
-) -> Figure:
-    """Curves of shares, some with bands.
-
-    Args:
-        x_values: [point].
-        by_name: Value, low and high of each curve, [point].
-        banded: Curves whose low and high are shown.
-        numbers: Of the look of each curve.
-    """
-    bands, curves = list[Trace](), list[Trace]()
-    for name, (value, low, high) in by_name.items():
-        look = charts.look_of(numbers[name])
-        if name in banded:
-            bands.append(charts.band(x_values, low, high, look["color"], showlegend=False))
-        curves.append(charts.curve(plain(name, NAME), x_values, value, look))
-    ends = {"range": x_values[[0, -1]].tolist()}
-    axes = {"xaxis": axis(x_title, **ends), "yaxis": axis(y_title, range=[0, 1.02])}
-    return {"data": [*bands, *curves], "layout": charts.WITH_LEGEND | axes}
 
 
 def points(rows: Sequence[tuple[str, Range, Range]], numbers: Mapping[str, int], x_title: str, y_title: str) -> Figure:

@@ -331,7 +331,7 @@ def test_a_replay_begins_with_the_first_state(tmp_path):
 
 def test_a_replay_publishes_a_request_under_the_key_of_its_arm_or_auctioneer(tmp_path):
     recorder = recorded(tmp_path, state("a", 1), operation(1))
-    recorder.add_unnumbered("a", Operation("a", 2.0, ControlRequest("pause", Pause(), "ann")))
+    recorder.add("a", Operation("a", 2.0, ControlRequest("pause", Pause(), "ann")), numbered=False)
     recorder.write()
     link, arm = stub(), stub()
     messages = open_messages(tmp_path)
@@ -631,7 +631,8 @@ def record_peers(folder, jobs, events=(), actions=()):
         fields = {"value": 0.0} if kind in ("award", "finish") else {"reason": "".join(reason)}
         recorder.add("arm_0", ArmEvent("arm_0", number, time_s, kind, job, epoch="now", **fields))
     for time_s, action in actions:
-        recorder.add_unnumbered("arm_1", Operation("arm_1", time_s, ControlRequest(str(time_s), action, "ann")))
+        operation = Operation("arm_1", time_s, ControlRequest(str(time_s), action, "ann"))
+        recorder.add("arm_1", operation, numbered=False)
     recorder.write(status="finished")
     return open_recording(folder)
 
