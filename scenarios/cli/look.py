@@ -405,7 +405,7 @@ def report_command(
     if (folder / CARD).exists():
         raise FleetError(f"'{folder}' is of `thermofleet compare`: open its index.html in a browser.")
     if (folder / "fleet.json").exists() and (folder / "recording").is_dir():
-        raise FleetError(f"'{folder}' is of `thermofleet live`: give '{folder / 'recording'}'.")
+        raise FleetError(f"'{folder}' is of `thermofleet up`: give '{folder / 'recording'}'.")
     if trace is not None:
         from scenarios.live.trace import thread_of, thread_table
 

@@ -399,6 +399,15 @@ def test_an_earlier_name_of_a_command_names_a_present_one():
     assert {name.split()[0] for name in COMMANDS if " " in name} == set(GROUPS)
 
 
+def test_every_command_that_the_product_speaks_of_exists():
+    root = Path(__file__).parents[2]
+    paths = [path for folder in ("agents", "fleet", "scenarios", "twin") for path in (root / folder).rglob("*.py")]
+    text = "".join(path.read_text(encoding="utf-8") for path in paths)
+    said = set(re.findall(r"`thermofleet ([a-z]+)( [a-z0-9]+\b)?", text))
+    assert len(said) > 20
+    assert not {one + more for one, more in said if one not in COMMANDS and (one + more) not in {*COMMANDS, *GROUPS}}
+
+
 def test_defaults_that_the_help_states_are_those_of_the_modules_that_it_does_not_load():
     def default(command, name):
         return next(each.default for each in load_command(command).params if each.name == name)

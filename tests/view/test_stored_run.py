@@ -305,7 +305,7 @@ WRONG = {
     "view quikstart": "nor a scenario 'quikstart'; did you mean 'quickstart'?",
     "report RUN --out r.csv": "--out must end in .html (got",
     "report RUN --out r": "--out must end in .html (got",
-    "report fleet": "is of `thermofleet live`: give",
+    "report fleet": "is of `thermofleet up`: give",
     "report study": "is of `thermofleet compare`: open its index.html in a browser.",
     "report nowhere": "There is no folder 'nowhere'. Give the folder of a run or of a recording.",
     "report nowhere --trace fault": "There is no folder 'nowhere'.",
