@@ -261,6 +261,8 @@ def generate_command(
     robot, fixtures, make_known = subject_of(scenario, arm, twins, network, tilt, tool)
     if scenario is None and not posture:
         raise FleetError("Without a SCENARIO no motion is known: give --posture at least twice.")
+    if payload and not posture:
+        raise FleetError("--payload is for --posture; the scenario's jobs have their own: leave it out.")
     sources = motion_through(ArmModel(robot, fixtures), posture, payload) if posture else None
     check_free(out, GENERATED, overwrite=overwrite)
     with progress_bar() as progress:
@@ -462,6 +464,8 @@ def score_command(
     given: Given = {name: value for name, value in (("alpha", alpha), ("reading", reading)) if value is not None}
     if not verdict and (given or map_ is not None):
         raise FleetError("--alpha, --reading and --map are for --verdict: leave them out.")
+    if as_json and format_ != "table":
+        raise FleetError(f"--json and --format {format_} name two formats: leave one out.")
     if follow:
         if log is None or verdict:
             raise FleetError("--follow needs --log FILE.csv, and does not go with --verdict, which judges a whole log.")

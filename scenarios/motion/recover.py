@@ -542,11 +542,11 @@ def motion_through(model: ArmModel, postures: Sequence[str], payload_kg: float) 
     """The motion from posture to posture and back, each a name or seven angles in degrees.
 
     Raises:
-        FleetError: a posture cannot be read, there is only one, or the motion is not possible.
+        FleetError: a posture cannot be read, all are the same, or the motion is not possible.
     """
-    if len(postures) < 2:
-        raise FleetError(f"A motion has at least two postures (got {len(postures)}). Give --posture again.")
     stops = np.stack([parse_posture(each, model.position_range) for each in postures])
+    if (stops == stops[0]).all():
+        raise FleetError(f"A motion has at least two different postures (got {'; '.join(postures)}).")
     try:
         return (plan_motion(model, stops, dwell_s=STOP_S, payload_kg=payload_kg, speed=Nearby().speed),)
     except InfeasibleJob as error:

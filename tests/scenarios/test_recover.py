@@ -143,7 +143,7 @@ def test_an_arm_of_logs_needs_no_scenario(thermofleet, subject, tmp_path):
     for wrong, sentence in (
         (known[2:], "Give a SCENARIO, or --twins and --network of an arm that is known by its logs"),
         (known, "Without a SCENARIO no motion is known: give --posture at least twice"),
-        ((*known, *stops[:2]), "A motion has at least two postures (got 1)"),
+        ((*known, *stops[:2]), "A motion has at least two different postures (got 0,20,180,-90,0,-20,90)."),
         ((*known, *stops, "--tilt", "0,90"), "The tilt is three angles in degrees, as 0,90,0 (got '0,90'"),
         (("quickstart", "--tilt", "0,90,0"), "--tilt and --tool are for an arm without a scenario"),
     ):

@@ -148,6 +148,15 @@ def test_the_twin_of_one_arm_of_a_scenario_scores_its_jobs(thermofleet, small_to
         (["score", "HERE"], "Give either a scenario or --log"),
         (["score", "HERE", "quickstart", "--format", "cvs"], "No format 'cvs'; did you mean 'csv'?"),
         (["score", "HERE", "quickstart", "--alpha", "0.1"], "--alpha, --reading and --map are for --verdict: leave"),
+        (["score", "HERE", "quickstart", "--format", "csv", "--json"], "--json and --format csv name two formats"),
+        (
+            ["generate", "quickstart", "--payload", "2"],
+            "--payload is for --posture; the scenario's jobs have their own",
+        ),
+        (
+            ["generate", "quickstart", "--posture", "raised", "--posture", "raised"],
+            "different postures (got raised; rai",
+        ),
         (["report", "quickstart", "--arm", "arm_9"], "No arm 'arm_9' in quickstart"),
         (["identify", "--log", "HERE/nowhere"], "nowhere"),
         (["recover", "quickstart", "--posture", "raisd"], "No posture 'raisd'; did you mean 'raised'?"),
