@@ -596,6 +596,9 @@ def report_command(
         if log is not None:
             title, source = f"The twin of the logs in {log.name}", f"--log {log.name}"
             recordings = options.arm_recordings(log, arm, skip_damaged, progress=progress)
+            if len(twin_report.cool_logs(recordings)) == len(recordings):
+                hot = f"{twin_report.LOG_HOT_C:g} °C on joint {twin_report.LOADED_JOINT + 1}"
+                say(f"No log reaches {hot}: the chapters that compare cool with hot motion will fail. Add hotter logs.")
             subjects = list[twin_report.Subject]()
             for seed in range(seeds):
                 progress("training", Count(seed, seeds))

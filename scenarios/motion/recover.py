@@ -315,7 +315,7 @@ class Recovery:
     best_error: dict[str, float]
     """Smallest one-sided torque error of the hottest motor, z units, by origin of the candidates."""
     time_s: Array
-    """Time since the start of the hold, s, [time]."""
+    """Time since the arm left home to hold, at `start_c`, s, [time]."""
     without_c: Array
     """True winding temperatures without recovery, °C, [time, joint]."""
     with_c: Array
@@ -388,8 +388,8 @@ def recover(
         passed_over=passed_over,
         best_error=best_error,
         time_s=time_s,
-        without_c=_held(stayed, time_s),
-        with_c=_held(recovered, time_s),
+        without_c=stayed.temp_c[: len(time_s)],
+        with_c=recovered.temp_c[: len(time_s)],
         error_rad=recovered.error_rad,
     )
 

@@ -15,6 +15,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
+from fleet.errors import FleetError
 from scenarios.cli.main import main
 from scenarios.cli.twin import SHOWN_OF_LOG, doubts_of, network_of, subject_of
 from scenarios.prepare.twins import LOG_INPUT
@@ -175,6 +176,17 @@ def test_bad_input_is_told_in_one_sentence_and_nothing_is_written(thermofleet, t
     assert sentence in said.err
     assert said.err.count("\n") == 1
     assert sorted(p.name for p in tmp_path.iterdir()) == before
+
+
+def test_a_report_of_cool_logs_alone_says_first_what_will_fail(thermofleet, logs, tmp_path, monkeypatch):
+    def stop(*_args, **_more):
+        raise FleetError("stop")
+
+    monkeypatch.setattr("scenarios.show.twin_report.log_subject", stop)
+    for log, count in ((logs / "cool", 1), (logs / "hot.csv", 0)):
+        said = thermofleet("twin", "report", "--log", log, "--out", tmp_path / "report")
+        assert said.err.count("No log reaches 40 °C on joint 2: the chapters") == count
+        assert said.err.endswith("Error: stop\n")
 
 
 def test_a_damaged_log_can_be_read_without_its_bad_lines(thermofleet, twins, tmp_path):
