@@ -46,8 +46,8 @@ def test_the_hottest_motor_cools_and_is_cooler_than_without(subject, asked, name
     found = recover(subject.twin, subject.arm, q, payload_kg, seed=len(name), **hold)
     hot = found.hottest
     assert hot == 1
-    np.testing.assert_array_equal(found.with_c[0], start_c[WINDING])
-    np.testing.assert_array_equal(found.without_c[0], start_c[WINDING])
+    np.testing.assert_allclose(found.with_c[0], start_c[WINDING], rtol=1e-6)  # kept as float32
+    np.testing.assert_array_equal(found.without_c[0], found.with_c[0])
     assert found.with_c[0, hot] == pytest.approx(until_c, abs=0.2)
     assert found.with_c[-1, hot] < found.with_c[0, hot]
     watched, gone = (found.time_s <= 30.0), (found.time_s >= 40.0)
