@@ -21,7 +21,7 @@ import numpy as np
 from rich.console import Console
 
 from benchmarks.freeze_suite import surprises_in
-from benchmarks.paper.harness import WIDEST, KeyedRows, Unit, compute, matching, mean_by_group, number, plain, table_of
+from benchmarks.paper.harness import WIDEST, KeyedRows, Unit, compute, matching, mean_share, number, plain, table_of
 from fleet.arm.model import ArmModel
 from fleet.engine.shift import StepRecord, stack_records
 from fleet.engine.world import Arm, World
@@ -413,7 +413,7 @@ def summary(rows: Sequence[Row]) -> Iterator[tuple[str, Row]]:
 
 def share_of(values: Iterable[tuple[str, bool]]) -> list[float]:
     """Mean of the cells' shares with its interval: mean, low, high."""
-    found = mean_by_group(((cell, float(value)) for cell, value in values), least=0.0, most=1.0)
+    found = mean_share((cell, float(value)) for cell, value in values)
     return [found.mean, found.low, found.high]
 
 

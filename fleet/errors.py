@@ -204,6 +204,6 @@ def visible(text: str, keep: str = "") -> str:
     return "".join(char if char.isprintable() or char in keep else json.dumps(char)[1:-1] for char in text)
 
 
-def install(extra: str) -> str:
+def install(extra: str, constraints: str = "constraints.txt") -> str:
     """Command that installs an extra, for an error message; no package index has thermofleet."""
-    return f"pip install -e '.[{extra}]' -c constraints.txt, in a copy of the repository"
+    return f"pip install -e '.[{extra}]' -c {constraints}, in a copy of the repository"

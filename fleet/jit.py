@@ -142,7 +142,11 @@ def _note_of(function: Callable[..., Any]) -> Path:
 
 @cache
 def _announce(folder: Path) -> None:
-    log.warning("Compiling the simulation engine (once, about half a minute of one core); cached in %s.", folder)
+    log.warning(
+        "Compiling functions (once: half a minute of one core for the simulation engine, some seconds for others); "
+        "cached in %s.",
+        folder,
+    )
 
 
 def compile_cached(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -29,7 +29,7 @@ def read_card(path: Path, kind: type[Card], *, format_: int, what: str) -> Card:
     """The card in a file of the supported format version; `what` names its content in errors.
 
     Raises:
-        CheckpointError: the file is missing or damaged, or of another format.
+        CheckpointError: the file is missing, damaged or not readable, or of another format.
     """
     try:
         text = path.read_bytes()
@@ -39,8 +39,10 @@ def read_card(path: Path, kind: type[Card], *, format_: int, what: str) -> Card:
                 f"{path}: format {head.format!r} is not supported, only {format_}. Make it again with this version."
             )
         return msgspec.json.decode(text, type=kind)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise CheckpointError(f"No {what} in {path.parent}: {path.name} is missing.") from None
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be read: {error.strerror or error}.") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:  # not JSON, or of another shape
         raise CheckpointError(f"{path}: {error}") from error
 

@@ -20,13 +20,14 @@ class Rows:
     """The rows of a file, by key; a later row replaces an earlier one. Reading leaves the file as it is.
 
     Raises:
-        FleetError: the file has a line that is no row.
+        FleetError: the file cannot be read, or has a line that is no row.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.by_key: dict[str, Row] = {}
-        data = path.read_bytes() if path.exists() else b""
+        with disk_errors(path):
+            data = path.read_bytes() if path.exists() else b""
         *lines, unfinished = data.split(b"\n")
         self._size, self._unfinished = len(data), len(unfinished)
         """Bytes of the file, and those of its last line if a process was stopped while it wrote."""

@@ -30,7 +30,7 @@ MOST_WRAPPERS = 8
 """Wrappers in one another; more than a policy can need."""
 METHODS = {
     "central": {"reset": "rng", "act": "observations"},
-    "arm": {"reset": "rng", "choose": "observation, place"},
+    "arm": {"reset": "rng", "choose": "observation, arm_index"},
 }
 """Methods, and their arguments, that a policy of each scope must have."""
 
@@ -321,7 +321,7 @@ def _made_by(name: str) -> tuple[Callable[[], Policy] | Callable[[], ArmPolicy],
     if scope not in SCOPES:
         raise FleetError(
             f"The policy '{name}' has no valid scope (got {scope!r}). Set in the class: scope = \"central\" if its "
-            'act(observations) sees all arms, or scope = "arm" if its choose(observation, place) sees one.'
+            'act(observations) sees all arms, or scope = "arm" if its choose(observation, arm_index) sees one.'
         )
     missing = [method for method in METHODS[scope] if not callable(getattr(example, method, None))]
     if missing:

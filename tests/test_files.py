@@ -76,7 +76,7 @@ def test_a_cache_is_private_to_its_owner(tmp_path, monkeypatch):
 
 ROOT = Path(__file__).parents[1]
 DECORATORS = {"jit", "jit_inline", "kernel"}
-MESSAGE = "Compiling the simulation engine"
+MESSAGE = "Compiling functions (once: half a minute of one core for the simulation engine, some seconds for others)"
 DRAW = """
 import numpy as np
 from fleet.env.random_actions import random_legal

@@ -25,7 +25,8 @@ class Rule:
     """Motion is anomalous if its p-value is at most alpha.
 
     A cool job, exchangeable with the cool jobs of one kind that calibrated the twin, is called anomalous with
-    probability <= alpha, over the draw of the calibration and the job.
+    probability <= alpha, over the draw of the calibration and the job. With the reading `latent` this is approximate:
+    the cluster from which it measures distances is that of the calibrating jobs themselves.
 
     Raises:
         NoGuarantee: the twin has no calibration, or too few jobs for alpha.
@@ -73,8 +74,9 @@ class Rule:
     def guarantee(self) -> str:
         """Guarantee of the verdict, as a sentence."""
         kinds = len(np.unique(self.calibration.group))
+        most = "About" if self.reading == "latent" else "At most"
         return (
-            f"At most {self.alpha:.3g} of new cool jobs are called anomalous, if they are like the held-out ones "
+            f"{most} {self.alpha:.3g} of new cool jobs are called anomalous, if they are like the held-out ones "
             f"({len(self.calibration.group)} jobs of {kinds} kind{'s' * (kinds > 1)})."
         )
 

@@ -22,6 +22,7 @@ from benchmarks.paper.harness import (
 )
 from benchmarks.paper.subjects import SHORT, Study, make_study, sensed, with_steps
 from benchmarks.paper.transfer import continue_training
+from fleet.errors import FleetError
 from fleet.heat.motor import Motors
 from fleet.heat.thermal import ThermalModel, thermal_model
 from fleet.motion import Plan
@@ -91,6 +92,15 @@ class DriftSize:
     threshold: float = 5.0
     """Of a CUSUM, in standard deviations of a day."""
     config: TwinConfig = SHORT
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.reference <= self.onset < self.days:
+            raise FleetError(
+                "--reference must be 2 or more and at most --onset, and --onset less than --days, so that something "
+                f"changes (got {self.reference}, {self.onset} and {self.days})."
+            )
+        if self.jobs > self.pool:
+            raise FleetError(f"--jobs must be at most --pool (got {self.jobs} and {self.pool}).")
 
 
 @dataclass(frozen=True, eq=False)

@@ -120,6 +120,10 @@ class FeatureSize:
     steps: int = 400
     config: TwinConfig = SHORT
 
+    def __post_init__(self) -> None:
+        if min(self.labels) < 2 * FOLDS:
+            raise FleetError(f"--labels must be {2 * FOLDS} or more for a cross-validation (got {min(self.labels)}).")
+
 
 def worn_jobs(study: Study, rng: np.random.Generator) -> tuple[Sample, dict[str, Array]]:
     """The study's test jobs as recorded by the arm in random states of wear, and their targets [job] by name."""
@@ -180,13 +184,7 @@ def cross_validated(
 
 
 def feature_rows(seed: int, size: FeatureSize, _wanted: Collection[str]) -> Iterator[tuple[str, Row]]:
-    """Every target from every input, by number of labelled jobs.
-
-    Raises:
-        FleetError: fewer labels than folds.
-    """
-    if min(size.labels) < 2 * FOLDS:
-        raise FleetError(f"--labels must be {2 * FOLDS} or more for a cross-validation (got {min(size.labels)}).")
+    """Every target from every input, by number of labelled jobs."""
     root = np.random.SeedSequence(seed)
     study = make_study(child(root, 0), train=size.train, reference=0, test=max(size.labels), novel=0)
     parts = records(sensed(study.train.plans, study.motors))

@@ -24,6 +24,7 @@ from benchmarks.paper.harness import (
     content_key,
     matching,
     mean_by_group,
+    mean_share,
     names,
     size_given,
     size_options,
@@ -304,7 +305,7 @@ def form_tables(rows: Sequence[Row]) -> dict[str, Table]:
     lines: list[tuple[str, ...]] = []
     for name in dict.fromkeys(row["form"] for row in rows):
         own = [(arm_of(row["arm"]), row) for row in matching(rows, form=name)]
-        cells = {each: mean_by_group((arm, row[each]) for arm, row in own).text(3) for each in MEASURES}
+        cells = {each: mean_share((arm, row[each]) for arm, row in own).text(3) for each in MEASURES}
         lead = mean_by_group((arm, row["any"] - rival[row["arm"], row["training"]]) for arm, row in own)
         label = FORMS[name].label if name in FORMS else RIVALS[name]
         less = "" if name == "torque" else lead.text(3, "+")

@@ -9,6 +9,7 @@ import hashlib
 import sys
 from argparse import ArgumentParser, ArgumentTypeError, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
@@ -61,6 +62,11 @@ def mean_by_group(values: Iterable[tuple[str, float]], *, least: float = -np.inf
     return interval([np.mean(each) for each in several] if len(several) > 1 else several[0], least=least, most=most)
 
 
+def mean_share(values: Iterable[tuple[str, float]], *, measure: str = "") -> Interval:
+    """As `mean_by_group`, of shares or of a measure of ranking, `auroc`, `auprc` or `spearman`."""
+    return mean_by_group(values, least=-1.0 if measure == "spearman" else 0.0, most=1.0)
+
+
 def no_options(parser: ArgumentParser) -> None:
     """Options of a study without options."""
 
@@ -88,8 +94,11 @@ def one_row(key: str, compute: Callable[[], Mapping[str, Any]]) -> Unit:
     return Unit((key,), lambda _: [(key, compute())])
 
 
-def compute(units: Sequence[Unit], rows: Rows) -> None:
+def compute(units: Sequence[Unit], rows: Rows, **mark: str) -> None:
     """Append the missing rows of the units.
+
+    Args:
+        mark: What every row says, too.
 
     Raises:
         FleetError: the file cannot be written, or an error of the study.
@@ -99,7 +108,7 @@ def compute(units: Sequence[Unit], rows: Rows) -> None:
     began_s, done, total = monotonic(), 0, sum(len(keys) for _, keys in missing)
     for unit, keys in missing:
         for key, row in unit.compute(keys) if keys else ():
-            rows.append(key, plain(row))
+            rows.append(key, mark | plain(row))
             done += 1
             print(f"{done} of {total} rows, {brief(monotonic() - began_s)}: {key}", file=sys.stderr, flush=True)
 
@@ -162,8 +171,12 @@ def run(name: str, study: Experiment, argv: Sequence[str]) -> None:
     parser.add_argument("--show", action="store_true", help="compute nothing: print the rows of the file")
     given = parser.parse_args(argv)
     units, rows = study.units(given), Rows(given.out)
+    if others := {row.get("study", name) for row in rows.by_key.values()} - {name}:
+        raise FleetError(
+            f"'{given.out}' has rows of the study {', '.join(sorted(others))}: name another file with --out."
+        )
     if not given.show:
-        compute(units, rows)
+        compute(units, rows, study=name)
     wanted = rows.some(key for unit in units for key in unit.keys)
     if not wanted:
         raise FleetError(
@@ -193,6 +206,14 @@ def whole(least: int) -> Callable[[str], int]:
     return convert
 
 
+def nonnegative(text: str) -> float:
+    """Converter of an option: a finite number from 0; raises as `whole`."""
+    with suppress(ValueError):
+        if 0 <= float(text) < np.inf:
+            return float(text)
+    raise ArgumentTypeError(f"must be a number from 0 (got '{text}')")
+
+
 def wholes(text: str) -> list[int]:
     """Converter of an option: whole numbers from 0, separated by commas, each once; raises as `whole`."""
     return list(dict.fromkeys(whole(0)(part.strip()) for part in text.split(",")))
@@ -220,7 +241,7 @@ def scenarios_of(given: Sequence[str]) -> list[Scenario]:
 
 
 def size_options(parser: ArgumentParser, size: type[Any]) -> None:
-    """Add an option for each whole number of a size, such as --test.
+    """Add an option for each whole number of a size, such as --test; at least 1, or what its metadata say.
 
     Args:
         size: A dataclass (Any: of any study); its other fields have no options.
@@ -232,7 +253,8 @@ def size_options(parser: ArgumentParser, size: type[Any]) -> None:
         if some or (isinstance(default, int) and not isinstance(default, bool)):
             text = " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
             flag = f"--{each.name.replace('_', '-')}"
-            group.add_argument(flag, type=whole(0), nargs=some, metavar="N", help=f"[{text}]")
+            least = each.metadata.get("least", 1)
+            group.add_argument(flag, type=whole(least), nargs=some, metavar="N", help=f"[{text}]")
 
 
 def size_given(given: Namespace, size: type[Any]) -> Any:

@@ -13,7 +13,7 @@ dynamics. With one payload for all, the sides differ by motion only.
 import math
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any  # values of the JSON
 
@@ -27,8 +27,9 @@ from benchmarks.paper.harness import (
     Experiment,
     Unit,
     content_key,
-    mean_by_group,
+    mean_share,
     names,
+    nonnegative,
     one_row,
     scenarios_of,
     size_given,
@@ -67,10 +68,14 @@ class ArmSize:
     """Numbers of jobs of an arm."""
 
     train: int = 200
-    exploration: int = 64
+    exploration: int = field(default=64, metadata={"least": 0})
     reference: int = 200
     test: int = 500
     novel: int = 150
+
+    def __post_init__(self) -> None:
+        if self.exploration > self.train:
+            raise FleetError(f"--exploration must be at most --train (got {self.exploration} and {self.train}).")
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +203,7 @@ def reading_cells(rows: Sequence[Row], question: str) -> dict[str, dict[str, Int
     for reading in rows[0][question]:
         values = {m: [(arm_of(row["arm"]), row[question][reading][m]) for row in rows] for m in MEASURES}
         known = {m: [(arm, value) for arm, value in some if value is not None] for m, some in values.items()}
-        found[reading] = {m: mean_by_group(some) if some else Interval(math.nan) for m, some in known.items()}
+        found[reading] = {m: mean_share(some, measure=m) if some else Interval(math.nan) for m, some in known.items()}
     return found
 
 
@@ -387,7 +392,7 @@ def side_options(parser: ArgumentParser) -> None:
     parser.add_argument("scenario", nargs="?", default="quickstart", help="scenario [quickstart]")
     parser.add_argument("--arm", help="arm of the scenario [the first]")
     parser.add_argument("--count", type=whole(2), default=40, help="motions from each side [40]")
-    parser.add_argument("--s", type=float, default=1.0, help="perturbation in posterior standard deviations [1]")
+    parser.add_argument("--s", type=nonnegative, default=1.0, help="perturbation in posterior standard deviations [1]")
     parser.add_argument("--seed", type=whole(0), default=1, help="[1]")
     size_options(parser, ArmSize)
 

@@ -15,7 +15,7 @@ from benchmarks.paper.harness import (
     Experiment,
     Unit,
     matching,
-    mean_by_group,
+    mean_share,
     names,
     table_of,
     whole,
@@ -172,13 +172,8 @@ def surprise_tables(rows: Sequence[Row]) -> dict[str, Table]:
         if not own:
             continue
         p, passed = (np.concatenate([row[name] for row in own]) for name in ("p", "passed"))
-        brier = mean_by_group(
-            (
-                (cell_name(row["instance"]), float(np.square(np.subtract(row["p"], row["passed"])).mean()))
-                for row in own
-            ),
-            least=0.0,
-            most=1.0,
+        brier = mean_share(
+            (cell_name(row["instance"]), float(np.square(np.subtract(row["p"], row["passed"])).mean())) for row in own
         )
         auroc = roc_auc_score(passed, p) if 0 < passed.sum() < len(passed) else np.nan
         measured = (passed.mean(), p.mean(), calibration_error(p, passed), auroc)

@@ -24,6 +24,7 @@ from benchmarks.paper.harness import (
     content_key,
     matching,
     mean_by_group,
+    mean_share,
     names,
     size_given,
     size_options,
@@ -346,14 +347,16 @@ def _mean(rows: Sequence[Row], measure: str) -> float:
 
 
 def parsimony_tables(rows: Sequence[Row]) -> dict[str, Table]:
-    """A line for each model and number of jobs: means over the arms ± the 95 % margin, and the knees."""
+    """A line for each model and number of jobs: means over the arms with 95 % intervals, and the knees."""
     lines: list[tuple[str, ...]] = []
     for model in MODELS:
         by_jobs = {jobs: some for jobs in JOBS if (some := matching(rows, model=model, jobs=jobs))}
         knees = {measure: knee({jobs: _mean(some, measure) for jobs, some in by_jobs.items()}) for measure in RANKING}
         for jobs, some in by_jobs.items():
-            found = [mean_by_group((arm_of(row["subject"]), row[measure]) for row in some) for measure in RANKING]
-            cells = [f"{each.mean:.3f}" + f" ± {each.margin:.3f}" * (not each.note) for each in found]
+            cells = [
+                mean_share(((arm_of(row["subject"]), row[measure]) for row in some), measure=measure).text(3)
+                for measure in RANKING
+            ]
             reached = ", ".join(LABELS[measure] for measure in RANKING if knees[measure] == jobs)
             lines.append((model, str(jobs), f"{_mean(some, 'minutes'):.1f}", *cells, reached))
     heads = ("model", "jobs", "minutes of motion", "AUROC", "AUPRC", "Spearman", "knee of")
@@ -361,10 +364,18 @@ def parsimony_tables(rows: Sequence[Row]) -> dict[str, Table]:
 
 
 def parsimony_units(given: Namespace) -> list[Unit]:
-    """A unit for each subject."""
+    """A unit for each subject, with the amounts that its jobs allow.
+
+    Raises:
+        FleetError: they allow none.
+    """
+    most = size_given(given, Sizes).train
+    amounts = [jobs for jobs in JOBS if jobs <= most]
+    if not amounts:
+        raise FleetError(f"--train must be {JOBS[0]} or more (got {most}).")
     return [
         Unit(
-            tuple(parsimony_key(model, jobs, subject) for jobs in JOBS for model in MODELS),
+            tuple(parsimony_key(model, jobs, subject) for jobs in amounts for model in MODELS),
             partial(parsimony_rows, subject),
         )
         for subject in subjects_given(given)

@@ -30,6 +30,7 @@ from benchmarks.paper.subjects import (
     sensed,
     with_steps,
 )
+from fleet.errors import FleetError
 from fleet.robot import Mount, Robot
 from fleet.seeding import child
 from scenarios.evaluate.statistics import interval
@@ -76,6 +77,10 @@ class TransferSize:
     further_rate: float = 1e-3
     """Peak learning rate of the further training."""
     config: TwinConfig = BETTER
+
+    def __post_init__(self) -> None:
+        if list(self.jobs) != sorted(set(self.jobs)):
+            raise FleetError(f"--jobs must be ascending (got {', '.join(map(str, self.jobs))}).")
 
 
 def continue_training(

@@ -261,6 +261,8 @@ def generate_command(
     robot, fixtures, make_known = subject_of(scenario, arm, twins, network, tilt, tool)
     if scenario is None and not posture:
         raise FleetError("Without a SCENARIO no motion is known: give --posture at least twice.")
+    if payload and not posture:
+        raise FleetError("--payload is for --posture; the scenario's jobs have their own: leave it out.")
     sources = motion_through(ArmModel(robot, fixtures), posture, payload) if posture else None
     check_free(out, GENERATED, overwrite=overwrite)
     with progress_bar() as progress:
@@ -462,6 +464,8 @@ def score_command(
     given: Given = {name: value for name, value in (("alpha", alpha), ("reading", reading)) if value is not None}
     if not verdict and (given or map_ is not None):
         raise FleetError("--alpha, --reading and --map are for --verdict: leave them out.")
+    if as_json and format_ != "table":
+        raise FleetError(f"--json and --format {format_} name two formats: leave one out.")
     if follow:
         if log is None or verdict:
             raise FleetError("--follow needs --log FILE.csv, and does not go with --verdict, which judges a whole log.")
@@ -592,6 +596,9 @@ def report_command(
         if log is not None:
             title, source = f"The twin of the logs in {log.name}", f"--log {log.name}"
             recordings = options.arm_recordings(log, arm, skip_damaged, progress=progress)
+            if len(twin_report.cool_logs(recordings)) == len(recordings):
+                hot = f"{twin_report.LOG_HOT_C:g} °C on joint {twin_report.LOADED_JOINT + 1}"
+                say(f"No log reaches {hot}: the chapters that compare cool with hot motion will fail. Add hotter logs.")
             subjects = list[twin_report.Subject]()
             for seed in range(seeds):
                 progress("training", Count(seed, seeds))

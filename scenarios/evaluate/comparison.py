@@ -28,7 +28,7 @@ from scenarios.policy_loader import check_name, has_trainings, label, scope_of
 from scenarios.prepare.randomisation import Randomisation
 from scenarios.progress import Progress, check_progress, quiet
 from scenarios.spec.load import scenario_with
-from scenarios.spec.options import RISK, DifficultyName, RiskName
+from scenarios.spec.options import RISK, RiskName
 from scenarios.spec.schema import Scenario
 from scenarios.suite.splits import cell_name
 from scenarios.table import Table
@@ -172,7 +172,7 @@ def compare(
     *,
     seeds: Sequence[int] = range(20),
     baseline: str | None = None,
-    difficulty: DifficultyName = "twin",
+    difficulty: str = "twin",
     risk: RiskName = RISK,
     randomise: Randomisation | None = None,
     channel: Channel = PERFECT,
@@ -184,9 +184,10 @@ def compare(
 
     Args:
         scenario: A library name, a .toml file, or a `Scenario`.
-        policies: Names, FILE.py:CLASS, or folders of trained policies.
+        policies: Names, FILE.py:CLASS, or folders of trained policies; POLICY@SOURCE for one with another difficulty.
         seeds: Of the shifts. `thermofleet compare` takes ten by default, and round_robin as baseline if it is compared.
-        difficulty, risk: Source of the predictions and of P(saturation), as in `make_env`.
+        difficulty: Source of the predictions: one of `thermofleet compare --difficulty`.
+        risk: Source of P(saturation), as in `make_env`.
         baseline: The policy that differences refer to; default: the first.
         randomise: Varies the shifts beyond what the scenario draws, the same for every policy.
         channel: Topology, delay and loss of the arms' messages, the same for every policy.

@@ -20,7 +20,7 @@ from fleet.difficulty import Blind
 from fleet.engine.profile_plant import sample
 from fleet.engine.shift import initial, step
 from fleet.engine.world import Arm, build_world
-from fleet.errors import FleetError
+from fleet.errors import ArgumentError, FleetError
 from fleet.heat.motor import Motors, gen3_motors
 from fleet.heat.thermal import NODES, WINDING, ThermalModel, gen3_network, thermal_model
 from fleet.job import Fixture, Job
@@ -238,14 +238,14 @@ def generate(
         fixtures: Boxes that neither the arm nor its payload may touch.
 
     Raises:
-        ValueError: s < 0, count < 1, or no source motion.
+        ArgumentError: count < 1, no source motion, or as `vary`.
         GenerationError: nothing passed.
     """
     if count < 1:
-        raise ValueError(f"The number of motions must be >= 1 (got {count}).")
+        raise ArgumentError(f"The number of motions must be >= 1 (got {count}).")
     usable = [plan for plan in sources if plan.work.kind != "press"]
     if not usable:
-        raise ValueError(f"Generation needs a source motion, not a press, for arm '{arm.robot.name}' (got none).")
+        raise ArgumentError(f"Generation needs a source motion, not a press, for arm '{arm.robot.name}' (got none).")
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     model, rejected = ArmModel(arm.robot, fixtures), Counter[str]()
     clearance, motions, order = CollisionChecker(model), list[GeneratedMotion](), list[int]()

@@ -315,7 +315,7 @@ class Recovery:
     best_error: dict[str, float]
     """Smallest one-sided torque error of the hottest motor, z units, by origin of the candidates."""
     time_s: Array
-    """Time since the start of the hold, s, [time]."""
+    """Time since the arm left home to hold, at `start_c`, s, [time]."""
     without_c: Array
     """True winding temperatures without recovery, °C, [time, joint]."""
     with_c: Array
@@ -388,8 +388,8 @@ def recover(
         passed_over=passed_over,
         best_error=best_error,
         time_s=time_s,
-        without_c=_held(stayed, time_s),
-        with_c=_held(recovered, time_s),
+        without_c=stayed.temp_c[: len(time_s)],
+        with_c=recovered.temp_c[: len(time_s)],
         error_rad=recovered.error_rad,
     )
 
@@ -542,11 +542,11 @@ def motion_through(model: ArmModel, postures: Sequence[str], payload_kg: float) 
     """The motion from posture to posture and back, each a name or seven angles in degrees.
 
     Raises:
-        FleetError: a posture cannot be read, there is only one, or the motion is not possible.
+        FleetError: a posture cannot be read, all are the same, or the motion is not possible.
     """
-    if len(postures) < 2:
-        raise FleetError(f"A motion has at least two postures (got {len(postures)}). Give --posture again.")
     stops = np.stack([parse_posture(each, model.position_range) for each in postures])
+    if (stops == stops[0]).all():
+        raise FleetError(f"A motion has at least two different postures (got {'; '.join(postures)}).")
     try:
         return (plan_motion(model, stops, dwell_s=STOP_S, payload_kg=payload_kg, speed=Nearby().speed),)
     except InfeasibleJob as error:

@@ -366,14 +366,9 @@ def training_files(recordings: Sequence[Recording], seed: int) -> set[str]:
     """Names of `LOG_TRAIN_SHARE` of the cool recordings, drawn by the seed.
 
     Raises:
-        FleetError: a recording has no temperatures, too few are cool, or none is left to test on.
+        FleetError: as `cool_logs`, too few are cool, or none is left to test on.
     """
-    cool = []
-    for r in recordings:
-        if r.temp_c is None:
-            raise FleetError(f"'{r.name}' has no motor temperatures; leave it out, or log temp_c.")
-        if r.temp_c[:, LOADED_JOINT].max(initial=-np.inf) < LOG_HOT_C:
-            cool.append(r.name)
+    cool = cool_logs(recordings)
     count = round(LOG_TRAIN_SHARE * len(cool))
     if not 0 < count < len(recordings):
         raise FleetError(
@@ -381,6 +376,21 @@ def training_files(recordings: Sequence[Recording], seed: int) -> set[str]:
             f"on {LOG_TRAIN_SHARE:.0%} of them and test on the rest needs at least two; add logs of light work."
         )
     return {cool[i] for i in np.random.default_rng(seed).permutation(len(cool))[:count]}
+
+
+def cool_logs(recordings: Sequence[Recording]) -> list[str]:
+    """Names of the recordings that never get hot.
+
+    Raises:
+        FleetError: a recording has no temperatures.
+    """
+    cool = list[str]()
+    for r in recordings:
+        if r.temp_c is None:
+            raise FleetError(f"'{r.name}' has no motor temperatures; leave it out, or log temp_c.")
+        if r.temp_c[:, LOADED_JOINT].max(initial=-np.inf) < LOG_HOT_C:
+            cool.append(r.name)
+    return cool
 
 
 # Error by epochs.

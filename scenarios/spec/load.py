@@ -87,6 +87,6 @@ def scenario_with(
         if name == "seed":
             raise ScenarioError("make_env() takes no seed: give it to reset(seed=…).")
         if name not in fields:
-            allowed = nearest(name, [*fields, *keywords_of(function)])
+            allowed = nearest(name, ["scenario", *fields, *keywords_of(function)])
             raise ScenarioError(f"{chosen.name} with overrides: unknown key '{name}'{allowed}")
     return override(chosen, **overrides) if overrides else chosen

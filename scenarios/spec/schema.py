@@ -284,8 +284,13 @@ class RewardSpec:
     energy: float = RewardWeights.energy
 
     def __post_init__(self) -> None:
-        given = (name for name in vars(RewardWeights()) if getattr(self, name) is not None)
+        given = [name for name in vars(RewardWeights()) if getattr(self, name) is not None]
         check_between(self, -MOST_WEIGHT, MOST_WEIGHT, *given)
+        for name in given:
+            if name != "finished_value" and getattr(self, name) > 0:
+                raise ValueError(
+                    f"RewardSpec.{name} must be <= 0, as costs are negative (got {getattr(self, name):g})."
+                )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,6 +17,8 @@ from scenarios.progress import Progress, quiet
 
 TRAINING = "training.json"
 """Settings that a resume must repeat; written after the first state, so that a folder with it can be resumed."""
+OPTION_OF = {"prepared": "--instances", "judges": "--validation-instances", "algorithm": "--algo"}
+"""Options of `thermofleet train` whose setting has another name in a card."""
 PAIRS_STATE, NETWORK_STATE = "training.npz", "training.pt"
 POLICIES = ("pairs.json", "policy.json")
 """Cards of trained policies (`agents.learned.policy.CARD` needs PyTorch)."""
@@ -174,7 +176,8 @@ def check_folder(out: Path, card: Mapping[str, Any], state: str, *, resume: bool
     was, now = (each | each.get("config", {}) | {"config": None} for each in (before, json.loads(json.dumps(card))))
     for name, value in now.items():
         if was.get(name) != value:
-            raise FleetError(f"The training in '{out}' has {name} = {was.get(name)!r} (got {value!r}).")
+            shown = OPTION_OF.get(name, name)
+            raise FleetError(f"The training in '{out}' has {shown} = {was.get(name)!r} (got {value!r}).")
 
 
 def _write_card(out: Path, card: Mapping[str, Any]) -> None:

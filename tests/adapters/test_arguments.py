@@ -1,11 +1,29 @@
 """What adapters are given is checked, so that no trainer fails on it later."""
 
+import importlib
+import sys
+
 import numpy as np
 import pytest
 
 from fleet.env.adapters.arguments import check_batch, check_env
 from fleet.env.allocation_v2 import parallel_env
 from fleet.env.validation import check_choice
+
+
+@pytest.mark.parametrize(
+    ("trainer", "library", "install"),
+    [
+        *(("sb3", "stable_baselines3", "sb3"), ("rllib", "ray", "rllib"), ("tianshou", "tianshou", "tianshou")),
+        *(("benchmarl", "benchmarl", "benchmarl"), ("torchrl", "tensordict", "learn")),
+    ],
+)
+def test_an_adapter_without_its_trainer_names_the_command_that_installs_it(monkeypatch, trainer, library, install):
+    constraints = "constraints.txt" if install == "learn" else rf"constraints/{install}\.txt"
+    monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.delitem(sys.modules, f"fleet.env.adapters.{trainer}", raising=False)
+    with pytest.raises(ModuleNotFoundError, match=rf"pip install -e '\.\[{install}\]' -c {constraints}"):
+        importlib.import_module(f"fleet.env.adapters.{trainer}")
 
 
 @pytest.mark.parametrize("mask_in", ["obs", "both"])
@@ -21,9 +39,9 @@ def test_masks_must_be_in_the_observations(small) -> None:
 
 @pytest.mark.parametrize("given", [None, 3, "quickstart", np.zeros(3)])
 def test_other_values_are_named(given) -> None:
-    with pytest.raises(ValueError, match=r"It takes an environment made by scenarios\.make_env\(\) \(got "):
+    with pytest.raises(ValueError, match=r"It takes an environment made by thermofleet\.make_env\(\) \(got "):
         check_env("It", given)
-    with pytest.raises(ValueError, match=r"It takes a batch made by scenarios\.make_batch\(\) \(got "):
+    with pytest.raises(ValueError, match=r"It takes a batch made by thermofleet\.make_batch\(\) \(got "):
         check_batch("It", given)
 
 

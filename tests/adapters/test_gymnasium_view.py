@@ -90,9 +90,9 @@ def test_a_row_of_many_is_the_dispatcher_alone(many, alone, shift) -> None:
 
 
 def test_what_it_cannot_take_is_refused(small_batch, small_workshop) -> None:
-    with pytest.raises(ValueError, match=r"DispatcherEnv takes an environment made by scenarios\.make_env\(\)"):
+    with pytest.raises(ValueError, match=r"DispatcherEnv takes an environment made by thermofleet\.make_env\(\)"):
         DispatcherEnv(small_batch())
-    with pytest.raises(ValueError, match=r"DispatcherVectorEnv takes a batch made by scenarios\.make_batch\(\)"):
+    with pytest.raises(ValueError, match=r"DispatcherVectorEnv takes a batch made by thermofleet\.make_batch\(\)"):
         DispatcherVectorEnv(small_workshop()())
 
 

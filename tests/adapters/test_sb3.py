@@ -172,7 +172,7 @@ def test_what_cannot_be_is_said(small_batch) -> None:
 
     with pytest.raises(ValueError, match="one of 'vector', 'dict'"):
         ArmsVecEnv(small_batch(), observation="flat")
-    with pytest.raises(ValueError, match=r"ArmsVecEnv takes a batch made by scenarios\.make_batch\(\) \(got 'x'\)"):
+    with pytest.raises(ValueError, match=r"ArmsVecEnv takes a batch made by thermofleet\.make_batch\(\) \(got 'x'\)"):
         ArmsVecEnv("x")
     with pytest.raises(ValueError, match="autoreset=True"):
         ArmsVecEnv(small_batch(autoreset=False))

@@ -182,7 +182,7 @@ def test_a_step_after_the_end_says_what_to_call(make) -> None:
 def test_a_batch_that_resets_by_itself_and_what_is_no_batch_are_refused(make) -> None:
     with pytest.raises(ValueError, match="autoreset=False"):
         TorchRLEnv(make.batch(2, autoreset=True))
-    with pytest.raises(ValueError, match=r"TorchRLEnv takes a batch made by scenarios\.make_batch\(\) \(got "):
+    with pytest.raises(ValueError, match=r"TorchRLEnv takes a batch made by thermofleet\.make_batch\(\) \(got "):
         TorchRLEnv("quickstart")  # pyright: ignore[reportArgumentType]
     wrong: Any = ({"seed": -1}, r"seed must be an integer from 0 to"), ({"joined": "x"}, "joined must be True or False")
     for options, says in wrong:

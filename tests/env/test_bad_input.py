@@ -231,6 +231,8 @@ def test_unknown_overrides_are_refused_with_the_nearest_name(cell, plans) -> Non
             make(cell, difficulty="twins", cache=plans)
     with pytest.raises(ScenarioError, match="unknown key 'render_mod'; did you mean 'render_mode'"):
         make_env(cell, difficulty="blind", cache=plans, render_mod="ansi")
+    with pytest.raises(ScenarioError, match="unknown key 'scenari'; did you mean 'scenario'"):
+        make_env(cell, scenari="x")
     with pytest.raises(ScenarioError, match="unknown key 'randomize'; did you mean 'randomise'"):
         make_batch(cell, 2, difficulty="blind", cache=plans, randomize=None)
     single = {"plant": "mujoco", "bus": "zenoh", "channel": None, "render_mode": "ansi", "mask_in": "info"}

@@ -1,6 +1,7 @@
 """The store, the table, the command line and the sweeps that all studies of the paper share."""
 
 import json
+from argparse import ArgumentParser
 from dataclasses import dataclass
 from functools import partial
 
@@ -8,8 +9,19 @@ import numpy as np
 import pytest
 
 from benchmarks.paper import harness, sweep
-from benchmarks.paper.harness import Experiment, Unit, compute, mean_by_group, one_row, seeded, table_of, wholes
-from benchmarks.paper.sweep import OURS, SWEEP, sweep_tables, train_regressor
+from benchmarks.paper.__main__ import main
+from benchmarks.paper.harness import (
+    Experiment,
+    Unit,
+    compute,
+    mean_by_group,
+    mean_share,
+    one_row,
+    seeded,
+    table_of,
+    wholes,
+)
+from benchmarks.paper.sweep import OURS, PARSIMONY, sweep_tables, train_regressor
 from fleet.errors import FleetError
 from scenarios.evaluate.statistics import interval
 from scenarios.json_rows import Rows
@@ -115,6 +127,16 @@ def test_groups_are_the_sample_if_there_are_several() -> None:
     assert mean_by_group(values[:2]) == interval([1.0, 3.0])
 
 
+def test_an_interval_of_shares_or_ranks_has_possible_values_only():
+    values = [("a", 0.99), ("b", 0.9), ("c", 0.2)]
+    free, share, rank = (
+        function(values) for function in (mean_by_group, mean_share, partial(mean_share, measure="spearman"))
+    )
+    assert free.low < 0 < 1 < free.high
+    assert (share.low, share.high) == (0.0, 1.0)
+    assert (rank.low, rank.high) == (max(free.low, -1.0), 1.0)
+
+
 def made_up(configuration: str, subject: str, auroc: float) -> dict:
     quality = dict.fromkeys(("auroc", "auprc", "spearman"), auroc)
     scores = dict.fromkeys(sweep.HOT, quality)
@@ -135,12 +157,51 @@ def test_differences_are_paired_by_arm():
 
 
 @pytest.mark.parametrize(
-    ("words", "says"), [(("--only", "beta"), "No configuration 'beta'"), (("--arms", "0,4"), "--arms must be 0 to 3")]
+    ("line", "says"),
+    [
+        ("sweep --only beta", "No configuration 'beta'"),
+        ("sweep --arms 0,4", "--arms must be 0 to 3"),
+        ("sweep --train 0", "--train: must be a whole number from 1 (got '0')"),
+        ("parsimony --train 2", "--train must be 3 or more (got 2)."),
+        ("readings --train 30", "--exploration must be at most --train (got 64 and 30)."),
+        ("forms --train 30", "--exploration must be at most --train (got 64 and 30)."),
+        ("readings --reference 0", "--reference: must be a whole number from 1 (got '0')"),
+        ("readings --train 0 --exploration 0", "--train: must be a whole number from 1 (got '0')"),
+        ("sides --train 30", "--exploration must be at most --train (got 64 and 30)."),
+        ("sides --s nan", "--s: must be a number from 0 (got 'nan')"),
+        ("sides --s=-1", "--s: must be a number from 0 (got '-1')"),
+        ("features --train 0", "--train: must be a whole number from 1 (got '0')"),
+        ("features --labels 9", "--labels must be 10 or more for a cross-validation (got 9)."),
+        ("transfer --jobs 40 5", "--jobs must be ascending (got 40, 5)."),
+        ("drift --days 28", "something changes (got 14, 28 and 28)."),
+        ("drift --reference 1", "something changes (got 1, 28 and 84)."),
+        ("drift --period 0", "--period: must be a whole number from 1 (got '0')"),
+        ("drift --jobs 50", "--jobs must be at most --pool (got 50 and 40)."),
+    ],
 )
-def test_options_are_checked(words, says, tmp_path):
-    with pytest.raises(FleetError, match=says):
-        harness.run("sweep", SWEEP, [*words, "--out", str(tmp_path / "rows.jsonl")])
+def test_options_are_checked_before_any_work(line, says, tmp_path, capsys):
+    with pytest.raises(SystemExit) as end:
+        main([*line.split(), "--out", str(tmp_path / "rows.jsonl")])
+    assert end.value.code == 2
+    assert says in capsys.readouterr().err.splitlines()[-1]
     assert not (tmp_path / "rows.jsonl").exists()
+
+
+def test_amounts_beyond_the_jobs_are_no_rows():
+    parser = ArgumentParser()
+    PARSIMONY.options(parser)
+    (unit,) = PARSIMONY.units(parser.parse_args(["--scenarios", "quickstart", "--arms", "0", "--train", "30"]))
+    assert {int(key.split("/")[1]) for key in unit.keys} == {3, 5, 10, 20}
+
+
+def test_rows_of_another_study_and_a_folder_are_no_file_to_continue(tmp_path, capsys):
+    run(tmp_path, capsys)
+    others = Experiment(help="", units=lambda given: [one_row("a", dict)], tables=lambda rows: {})
+    for out, says in ((tmp_path / "rows.jsonl", "has rows of the study totals"), (tmp_path, "Is a directory")):
+        before = (tmp_path / "rows.jsonl").read_bytes()
+        with pytest.raises(FleetError, match=says):
+            harness.run("others", others, ["--out", str(out)])
+        assert (tmp_path / "rows.jsonl").read_bytes() == before
 
 
 def test_reading_leaves_a_file_as_it_is_and_a_row_replaces_an_unfinished_line(tmp_path):

@@ -31,10 +31,10 @@ def test_shares_have_their_intervals() -> None:
 
 
 def test_readings_are_means_over_arms_not_over_their_seeds() -> None:
-    values = {"s/a/0": 1.0, "s/a/1": 3.0, "s/b/0": 5.0, "s/b/1": None, "s/c/0": 6.0, "s/c/1": 6.0}
+    values = {"s/a/0": 0.1, "s/a/1": 0.3, "s/b/0": 0.5, "s/b/1": None, "s/c/0": 0.6, "s/c/1": 0.6}
     measures = {name: dict.fromkeys(MEASURES) | {"auroc": value} for name, value in values.items()}
     rows = [{"arm": name, "any": {"d": each}} for name, each in measures.items()]
     ((reading, found),) = reading_cells(rows, "any").items()
     assert reading == "d"
-    assert found["auroc"] == interval([2.0, 5.0, 6.0])
+    assert found["auroc"] == interval([0.2, 0.5, 0.6], least=0.0, most=1.0)
     assert np.isnan(found["hits"].mean)

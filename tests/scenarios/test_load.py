@@ -134,6 +134,7 @@ WRONG = [
     (put("arms", 0, "cooling_factor", 0), "arms[0].cooling_factor must be between 0.01 and 100 (got 0.0)."),
     (put("arms", 0, "ambient_offset_k", 1e9), "arms[0].ambient_offset_k must be between -50 and 50 (got 1000000000.0)"),
     (put("reward", "energy", -1e308), "reward.energy must be between -1000000000 and 1000000000 (got -1e+308)."),
+    (put("reward", "faults", 5.0), "reward.faults must be <= 0, as costs are negative (got 5)."),
     (put("ambient", "points", [[0]]), "ambient.points[0]: expected 2 values, got 1."),
     (put("ambient", "points", [[0, 400]]), "ambient.points must be between -40 and 60 °C (got [400.0])."),
     (put("planning", "speeds", []), "planning.speeds must have at least one share of the speed limits (got [])."),

@@ -85,7 +85,10 @@ def test_an_own_class_from_a_file_or_a_module(own):
             r"mine.py' names no class: give .*mine.py:CLASS\. Allowed: Idle, Lone, Needy, No, Old, Unset, make\.$",
         ),
         ("{own}:No", r"is no policy: of scope central it needs the methods reset\(rng\) and act\(observations\)"),
-        ("{own}:Old", r"Old' has no valid scope \(got None\). Set in the class: scope = .central. if its act"),
+        (
+            "{own}:Old",
+            r"Old' has no valid scope \(got None\). Set in the class: .* its choose\(observation, arm_index\)",
+        ),
         ("{own}:Needy", r"must be a class or function that is called without arguments \(missing a required argument:"),
         ("{own}:Unset", r"Unset has no central policy that an arm can have alone \(got None\)\. Add to the class"),
         ("nowhere.py:Idle", "there is no file 'nowhere.py'"),

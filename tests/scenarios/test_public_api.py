@@ -73,6 +73,10 @@ class Mine:
     [
         (lambda: tf.compare("quickstart", "wsept"), r"policies must be a list of names, .* \(got 'wsept'\)"),  # pyright: ignore
         (lambda: tf.compare("quickstart", ["wsept", Mine]), r"A policy is given by name: .*'mine.py:Mine' for a class"),  # pyright: ignore
+        (
+            lambda: tf.compare("quickstart", ["wspt"], difficulty="rc-nominl"),
+            "No difficulty 'rc-nominl'; did you mean 'rc-nominal'",
+        ),
         (lambda: tf.compare("quickstart", ["wsept"], seeds=[0, 1, 0]), "Seed 0 is given twice"),
         (lambda: tf.compare("quickstart", ["wsept"], seeds=[1.5]), r"seed must be an integer from 0 to \d+ \(got 1.5"),  # pyright: ignore
         (lambda: tf.compare("quickstart", ["wsept"], seeds=3), r"list of integers, for example range\(3\) \(got 3\)"),  # pyright: ignore

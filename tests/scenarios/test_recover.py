@@ -46,7 +46,9 @@ def test_the_hottest_motor_cools_and_is_cooler_than_without(subject, asked, name
     found = recover(subject.twin, subject.arm, q, payload_kg, seed=len(name), **hold)
     hot = found.hottest
     assert hot == 1
-    assert found.with_c[0, hot] == pytest.approx(until_c, abs=1.0)
+    np.testing.assert_allclose(found.with_c[0], start_c[WINDING], rtol=1e-6)  # kept as float32
+    np.testing.assert_array_equal(found.without_c[0], found.with_c[0])
+    assert found.with_c[0, hot] == pytest.approx(until_c, abs=0.2)
     assert found.with_c[-1, hot] < found.with_c[0, hot]
     watched, gone = (found.time_s <= 30.0), (found.time_s >= 40.0)
     # The hold without recovery begins with taking up the payload, a second longer at rest.
@@ -135,7 +137,7 @@ def test_an_arm_of_logs_needs_no_scenario(thermofleet, subject, tmp_path):
     start_c = hold_until(bare_arm(robot, gen3_motors(), Verification.nominal(robot, 25.0).thermal), q, 3.0,
                          ambient_c=25.0, until_c=50.0)  # fmt: skip
     card = json.loads((out / "recovery.json").read_text(encoding="utf-8"))
-    assert card["start_c"] == pytest.approx(start_c[:7].max(), abs=1.0)  # it cools on the way there
+    assert card["start_c"] == pytest.approx(start_c[:7].max())
     out = tmp_path / "generated"
     stops = ("--posture", "0,20,180,-90,0,-20,90", "--posture", "20,30,180,-60,0,-30,90")
     thermofleet("twin", "generate", *known, *stops, "--count", 2, "--s", 0, "--out", out).succeeded()
@@ -143,7 +145,7 @@ def test_an_arm_of_logs_needs_no_scenario(thermofleet, subject, tmp_path):
     for wrong, sentence in (
         (known[2:], "Give a SCENARIO, or --twins and --network of an arm that is known by its logs"),
         (known, "Without a SCENARIO no motion is known: give --posture at least twice"),
-        ((*known, *stops[:2]), "A motion has at least two postures (got 1)"),
+        ((*known, *stops[:2]), "A motion has at least two different postures (got 0,20,180,-90,0,-20,90)."),
         ((*known, *stops, "--tilt", "0,90"), "The tilt is three angles in degrees, as 0,90,0 (got '0,90'"),
         (("quickstart", "--tilt", "0,90,0"), "--tilt and --tool are for an arm without a scenario"),
     ):

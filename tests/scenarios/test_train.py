@@ -135,10 +135,10 @@ def test_validation_is_the_normalised_score_of_the_shift_of_the_benchmark(ground
 def test_a_training_leaves_a_central_policy_and_begins_with_its_teacher(tmp_path, ground) -> None:
     out, told = tmp_path / "pairs", list[str]()
 
-    def trained(iterations: int, *, resume: bool = False, samples: int = 4):
+    def trained(iterations: int, *, resume: bool = False, samples: int = 4, prepared: int = 1):
         plan = PairPlan(minutes=100_000.0, iterations=iterations, validate_every=1)
         config = EvolutionConfig(samples=samples)
-        card: dict[str, object] = {"suite": "train"}
+        card: dict[str, object] = {"suite": "train", "prepared": prepared}
         return train_pairs([ground], [ground], config, out, plan, card=card, resume=resume, tell=told.append)
 
     done = trained(2)
@@ -165,6 +165,8 @@ def test_a_training_leaves_a_central_policy_and_begins_with_its_teacher(tmp_path
     assert again.seconds > 100.0
     with pytest.raises(FleetError, match=r"has samples = 4 \(got 6\)"):
         trained(4, resume=True, samples=6)
+    with pytest.raises(FleetError, match=r"has --instances = 1 \(got 2\)"):
+        trained(4, resume=True, prepared=2)
     with pytest.raises(FleetError, match="has 3 iterations: --iterations must be more"):
         trained(3, resume=True)
     (out / PAIRS_STATE).unlink()

@@ -15,6 +15,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
+from fleet.errors import FleetError
 from scenarios.cli.twin import SHOWN_OF_LOG, doubts_of, network_of, subject_of
 from scenarios.prepare.twins import LOG_INPUT
 from tests.commands import call
@@ -143,6 +144,15 @@ def test_the_twin_of_one_arm_of_a_scenario_scores_its_jobs(thermofleet, small_to
         (["score", "HERE"], "Give either a scenario or --log"),
         (["score", "HERE", "quickstart", "--format", "cvs"], "No format 'cvs'; did you mean 'csv'?"),
         (["score", "HERE", "quickstart", "--alpha", "0.1"], "--alpha, --reading and --map are for --verdict: leave"),
+        (["score", "HERE", "quickstart", "--format", "csv", "--json"], "--json and --format csv name two formats"),
+        (
+            ["generate", "quickstart", "--payload", "2"],
+            "--payload is for --posture; the scenario's jobs have their own",
+        ),
+        (
+            ["generate", "quickstart", "--posture", "raised", "--posture", "raised"],
+            "different postures (got raised; rai",
+        ),
         (["report", "quickstart", "--arm", "arm_9"], "No arm 'arm_9' in quickstart"),
         (["identify", "--log", "HERE/nowhere"], "nowhere"),
         (["recover", "quickstart", "--posture", "raisd"], "No posture 'raisd'; did you mean 'raised'?"),
@@ -161,6 +171,17 @@ def test_bad_input_is_told_in_one_sentence_and_nothing_is_written(thermofleet, t
     assert sentence in said.err
     assert said.err.count("\n") == 1
     assert sorted(p.name for p in tmp_path.iterdir()) == before
+
+
+def test_a_report_of_cool_logs_alone_says_first_what_will_fail(thermofleet, logs, tmp_path, monkeypatch):
+    def stop(*_args, **_more):
+        raise FleetError("stop")
+
+    monkeypatch.setattr("scenarios.show.twin_report.log_subject", stop)
+    for log, count in ((logs / "cool", 1), (logs / "hot.csv", 0)):
+        said = thermofleet("twin", "report", "--log", log, "--out", tmp_path / "report")
+        assert said.err.count("No log reaches 40 °C on joint 2: the chapters") == count
+        assert said.err.endswith("Error: stop\n")
 
 
 def test_a_damaged_log_can_be_read_without_its_bad_lines(thermofleet, twins, tmp_path):

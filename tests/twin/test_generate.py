@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fleet.errors import ArgumentError
 from fleet.motion import RATE_HZ, Phase
 from fleet.robot import GEN3
 from twin.vae.config import TwinConfig
@@ -170,11 +171,19 @@ def test_the_same_seed_makes_the_same_motion(twin, plan):
 
 @pytest.mark.parametrize("s", [-0.1, np.nan, np.inf])
 def test_a_perturbation_is_a_number_of_zero_or_more(twin, plan, s):
-    with pytest.raises(ValueError, match=r"s must be a number >= 0"):
+    with pytest.raises(ArgumentError, match=r"s must be a number >= 0"):
         vary(twin, plan, s, np.random.default_rng(0))
+
+
+def test_an_autoencoder_reconstructs_only(source):
+    twin = exact_twin()
+    twin.config = TwinConfig(kind="ae")
+    assert vary(twin, source, 0.0, np.random.default_rng(0)).distance_rad < 0.02
+    with pytest.raises(ArgumentError, match=r"no posterior to draw from: give s = 0 \(--s 0\)"):
+        vary(twin, source, 1.0, np.random.default_rng(0))
 
 
 def test_a_plan_without_a_cycle_cannot_be_varied(twin, plan):
     empty = Phase(plan.cycle.profile[:0], plan.cycle.payload_kg[:0])
-    with pytest.raises(ValueError, match="no cycle"):
+    with pytest.raises(ArgumentError, match="no cycle"):
         vary(twin, replace(plan, cycle=empty), 1.0, np.random.default_rng(0))

@@ -253,6 +253,7 @@ def test_a_line_in_another_encoding_is_a_damaged_line(gen3):
 
 def test_a_table_that_is_no_telemetry_says_why(tmp_path: Path):
     path = tmp_path / "telemetry.parquet"
+    refused(path, "cannot be read: No such file or directory.", None)
     path.write_bytes(b"PAR1 and no more")
     refused(path, "is not a complete parquet file", None)
     columns = {"time_s": [0.0, 1.0, 2.0], **{name: [0.5] * 3 for name in PLAIN[1:]}}

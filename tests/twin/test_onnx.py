@@ -70,6 +70,12 @@ def test_the_example_needs_nothing_but_the_file(twin, exported, rng, motion, tmp
     head, *d = done.stdout.splitlines()
     assert twin.version in head
     np.testing.assert_allclose([float(each) for each in d], twin.measures_of(twin.window_features(x)).total, rtol=1e-4)
+    np.save(tmp_path / "windows.npy", x * np.nan)
+    for wrong, sentence in ((words[:3], "onnx_score.py twin.onnx windows.npy"), (words, "Windows must be finite.")):
+        refused = subprocess.run(wrong, capture_output=True, text=True, cwd=tmp_path, check=False)
+        assert (refused.returncode, refused.stdout) == (1, "")
+        assert sentence in refused.stderr
+        assert "Traceback" not in refused.stderr
 
 
 @pytest.mark.parametrize("change", [{"scope": "arm", "latent": 3}, {"kind": "ae"}, {"layers": 2}])

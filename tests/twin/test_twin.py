@@ -97,6 +97,16 @@ def test_a_damaged_checkpoint_is_refused_and_its_damage_named(folder, damage, wo
         load(folder)
 
 
+def test_a_file_in_place_of_a_folder_and_a_folder_in_place_of_a_file_are_refused(folder):
+    with pytest.raises(CheckpointError, match=r"No twin in .*twin\.json: twin\.json is missing"):
+        load(folder / CARD)
+    for name, words in ((WEIGHTS, rf"{WEIGHTS} does not fit"), (CARD, r"twin\.json cannot be read: Is a directory")):
+        (folder / name).unlink()
+        (folder / name).mkdir()
+        with pytest.raises(CheckpointError, match=words):
+            load(folder)
+
+
 def test_another_number_of_joints_is_refused(folder):
     with pytest.raises(CheckpointError, match="the twin has 7 joints, the arm has 6"):
         load(folder, joints=6)
@@ -271,6 +281,8 @@ def test_window_errors_are_the_mean_distance_to_what_the_posterior_mean_decodes_
     assert mu.shape == sigma.shape == (len(windows), 7, 2)
     assert np.all((sigma > 0) & (sigma < 1.5))
     np.testing.assert_allclose(twin.decode(mu), twin.reconstruct(windows), rtol=1e-5, atol=1e-5)
+    assert twin.window_errors(windows[:0]).shape == (0, 7, 3)
+    assert twin.decode(twin.posterior(windows[:0])[0]).shape == twin.reconstruct(windows[:0]).shape == (0, 12, 7, 3)
     with pytest.raises(ValueError, match=r"Latents must be \[batch, 7, 2\]"):
         twin.decode(mu[:, :, :1])
 

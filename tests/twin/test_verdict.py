@@ -74,7 +74,9 @@ def test_no_verdict_without_a_guarantee(twin, make_plan, motion):
     heavy = Features(features.packed * 10)
     assert rule.anomalous(heavy).all()
     np.testing.assert_array_equal(rule.p_value(heavy), 0.25)  # the larger of 1/5 and 1/4
+    assert rule.guarantee.startswith("At most 0.25 of new cool jobs")
     assert "7 jobs of 2 kinds" in rule.guarantee
+    assert replace(rule, reading="latent").guarantee.startswith("About 0.25 of new cool jobs")
 
 
 def test_a_recording_is_judged_by_its_worst_stretches(twin, recording_of, monkeypatch):

@@ -8,14 +8,14 @@ import re
 import zlib
 from array import array
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import groupby
 from math import isfinite
 from pathlib import Path
-from typing import Literal, NamedTuple, Self, get_args
+from typing import BinaryIO, Literal, NamedTuple, Self, get_args
 
 import numpy as np
 import pyarrow as pa
@@ -153,16 +153,24 @@ _PACKED = (b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf")
 """First bytes of bzip2, xz, Zstandard and 7z."""
 
 
+@contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
+    """The open file; raises a LogError if it cannot be opened or read."""
+    try:
+        with path.open("rb") as file:
+            yield file
+    except OSError as error:
+        raise LogError(str(path), None, f"cannot be read: {error.strerror or error}.") from error
+
+
 def read_csv(path: Path) -> LogTable:
     """The numbers of all good lines after the header; blank lines are ignored.
 
     Raises:
         LogError: the file cannot be opened, is empty, ends in .gz without gzip data, or has no header.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise LogError(str(path), None, f"cannot be read: {error.strerror or error}.") from error
+    with _opened(path) as file:
+        data = file.read()
     broken = None
     if data.startswith(_ZIP):
         raise LogError(str(path), None, "is a ZIP archive or an XLSX workbook. Unpack it, or save the sheet as CSV.")
@@ -439,12 +447,15 @@ def read_arms(path: Path) -> dict[str, LogTable]:
     """The readings of every arm, in the order of their first rows; the line of a row is its number in the file.
 
     Raises:
-        LogError: the file is not a complete parquet file, a row names no arm, or a column is not numeric.
+        LogError: the file cannot be opened or is not a complete parquet file, a row names no arm, or a column is not
+            numeric.
     """
-    try:
-        table = pq.read_table(path)
-    except (OSError, pa.ArrowInvalid) as error:
-        raise LogError(str(path), None, f"is not a complete parquet file ({str(error).splitlines()[0]}).") from error
+    with _opened(path) as file:
+        try:
+            table = pq.read_table(file)
+        except (OSError, pa.ArrowInvalid) as error:
+            reason = str(error).splitlines()[0]
+            raise LogError(str(path), None, f"is not a complete parquet file ({reason}).") from error
     if "tick" in table.column_names:
         reason = "is part of the recording of a fleet. A recording is a folder: publish it again with"
         raise LogError(str(path), None, f"{reason} `thermofleet bus replay`, or look at it with `thermofleet report`.")

@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.interpolate import BSpline
 
+from fleet.errors import ArgumentError
 from fleet.motion import RATE_HZ, Phase, Plan
 from fleet.robot import GEN3
 from twin.logs.recording import CONTINUOUS
@@ -65,14 +66,17 @@ def vary(twin: Twin, source: Plan, s: float, rng: np.random.Generator) -> Variat
         source: Motion like that on which the twin was trained.
 
     Raises:
-        ValueError: s is negative or not finite, or the source has no cycle, or other joints than the twin.
+        ArgumentError: s is negative or not finite, or > 0 of an autoencoder, or the source has no cycle.
+        ValueError: the source has other joints than the twin.
     """
     if not 0 <= s < np.inf:
-        raise ValueError(f"The perturbation s must be a number >= 0 of posterior standard deviations (got {s}).")
+        raise ArgumentError(f"The perturbation s must be a number >= 0 of posterior standard deviations (got {s}).")
     if len(source.cycle.profile) == 0:
-        raise ValueError(f"The plan of arm '{source.arm}' has no cycle to vary.")
+        raise ArgumentError(f"The plan of arm '{source.arm}' has no cycle to vary.")
     if s > 0 and twin.config.kind == "ae":
-        raise ValueError("A plain autoencoder has no posterior to draw from: give s = 0, or a twin of kind vae.")
+        raise ArgumentError(
+            f"A plain autoencoder has no posterior to draw from: give s = 0 (--s 0), or a twin of kind vae (got {s:g})."
+        )
     phases, errors = [], []
     paths = [_decoded(twin, resample(phase.profile, RATE_HZ, twin.config.rate_hz), s, rng) for phase in source.phases]
     for phase, path, (begin, end) in zip(source.phases, paths, _phase_ends(source, paths), strict=True):

@@ -201,8 +201,9 @@ class Networks:
         return z_hat, mu
 
     def _encode(self, z: Array) -> tuple[Array, Array]:
-        parts = z.reshape(*z.shape[:2], self.count, -1).transpose(1, 2, 3, 0)  # [time, net, channel, batch]
-        summary = np.tanh(_affine(self._unroll(self.encoder, parts, z.shape[1])[-1], self.summary))
+        batch, steps, joints, channels = z.shape
+        parts = z.reshape(batch, steps, self.count, joints * channels // self.count).transpose(1, 2, 3, 0)
+        summary = np.tanh(_affine(self._unroll(self.encoder, parts, steps)[-1], self.summary))
         mu = _affine(summary, self.mu)
         if self.logvar is None:
             sigma = np.zeros_like(mu)
@@ -213,7 +214,8 @@ class Networks:
     def _decode(self, latent: Array, steps: int) -> Array:
         first = np.tanh(_affine(latent.transpose(1, 2, 0), self.expand))
         z = _affine(self._unroll(self.decoder, first, steps), self.out)  # [time, net, channel, batch]
-        return z.transpose(3, 0, 1, 2).reshape(z.shape[3], steps, -1, len(CHANNELS))
+        joints = z.shape[1] * z.shape[2] // len(CHANNELS)
+        return z.transpose(3, 0, 1, 2).reshape(z.shape[3], steps, joints, len(CHANNELS))
 
     def _unroll(self, layers: Sequence[Linear], x: Array, steps: int) -> Array:
         """Hidden states of the highest layer, [time, net, hidden, batch].

@@ -1,5 +1,7 @@
-"""Checks of the environments and batches given to adapters, and the infos that adapters pass on."""
+"""Import of trainers, checks of the environments and batches given to adapters, and the infos that they pass on."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from gymnasium import spaces
@@ -7,6 +9,7 @@ from pettingzoo import ParallelEnv
 
 from fleet.engine.batch import TERMS
 from fleet.env.vector import BatchEnv
+from fleet.errors import install
 
 # Any: PettingZoo, Gymnasium and the trainers leave the types of observations, actions and infos open.
 Env = ParallelEnv[str, Any, Any]
@@ -16,6 +19,15 @@ Infos = dict[str, Any]
 ARM_INFOS = ("faults", "illegal", "peak_c", "above_warning_s")
 TEAM_INFOS = ("jobs_done", "elapsed_s", *(f"reward_{term}" for term in TERMS))
 """Infos of `BatchEnv.step` that are numbers, per arm and per team."""
+
+
+@contextmanager
+def imported_trainer(extra: str, constraints: str) -> Iterator[None]:
+    """Name the command that installs a trainer in the error of an import without it."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(f"{error}: {install(extra, constraints)}.", name=error.name) from error
 
 
 def check_batch(adapter: str, batch: object, *, autoreset: bool | None = None) -> BatchEnv:
@@ -28,7 +40,7 @@ def check_batch(adapter: str, batch: object, *, autoreset: bool | None = None) -
         ValueError: it is neither, or resets otherwise.
     """
     if not all(hasattr(batch, name) for name in ("num_envs", "autoreset", "layout")):
-        raise ValueError(f"{adapter} takes a batch made by scenarios.make_batch() (got {batch!r}).")
+        raise ValueError(f"{adapter} takes a batch made by thermofleet.make_batch() (got {batch!r}).")
     checked: Any = batch  # by the attributes above
     if autoreset is not None and checked.autoreset != autoreset:
         raise ValueError(
@@ -44,7 +56,7 @@ def check_env(adapter: str, env: object) -> Env:
         ValueError: it is not a `ParallelEnv`, or the masks are not there.
     """
     if not isinstance(env, ParallelEnv):
-        raise ValueError(f"{adapter} takes an environment made by scenarios.make_env() (got {env!r}).")
+        raise ValueError(f"{adapter} takes an environment made by thermofleet.make_env() (got {env!r}).")
     space = env.observation_space(env.possible_agents[0])
     if not isinstance(space, spaces.Dict) or set(space.keys()) != {"observation", "action_mask"}:
         raise ValueError(f"{adapter} needs the masks in the observations: make the environment with mask_in='obs'.")

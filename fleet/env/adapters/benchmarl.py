@@ -21,11 +21,13 @@ Traps:
 from collections.abc import Callable
 
 import numpy as np
-from benchmarl.environments.pettingzoo.common import PettingZooClass
-from torchrl.envs import EnvBase
-from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 
-from fleet.env.adapters.arguments import Env
+from fleet.env.adapters.arguments import Env, imported_trainer
+
+with imported_trainer("benchmarl", "constraints/benchmarl.txt"):
+    from benchmarl.environments.pettingzoo.common import PettingZooClass
+    from torchrl.envs import EnvBase
+    from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 
 GROUP = "arm"
 

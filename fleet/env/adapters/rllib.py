@@ -22,13 +22,15 @@ from collections.abc import Callable
 from typing import Any
 
 from gymnasium import spaces
-from ray.rllib.algorithms.ppo import PPOConfig
-from ray.rllib.core.rl_module.rl_module import RLModuleSpec
-from ray.rllib.env.multi_agent_env import MultiAgentEnv
-from ray.rllib.examples.rl_modules.classes.action_masking_rlm import ActionMaskingTorchRLModule
-from ray.tune.registry import register_env
 
-from fleet.env.adapters.arguments import Env, arm_space, check_env
+from fleet.env.adapters.arguments import Env, arm_space, check_env, imported_trainer
+
+with imported_trainer("rllib", "constraints/rllib.txt"):
+    from ray.rllib.algorithms.ppo import PPOConfig
+    from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+    from ray.rllib.env.multi_agent_env import MultiAgentEnv
+    from ray.rllib.examples.rl_modules.classes.action_masking_rlm import ActionMaskingTorchRLModule
+    from ray.tune.registry import register_env
 
 NAME = "thermofleet/allocation_v2"
 SHARED_POLICY = "arm"

@@ -22,12 +22,14 @@ from collections.abc import Iterable, Sequence
 from typing import Any, Literal, get_args
 
 import numpy as np
-from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecEnv
 
-from fleet.env.adapters.arguments import check_batch
+from fleet.env.adapters.arguments import check_batch, imported_trainer
 from fleet.env.validation import check_choice
 from fleet.env.vector import BatchEnv, Obs
+
+with imported_trainer("sb3", "constraints/sb3.txt"):
+    from stable_baselines3.common.monitor import Monitor
+    from stable_baselines3.common.vec_env import VecEnv
 
 Array = np.ndarray
 Kind = Literal["vector", "dict"]

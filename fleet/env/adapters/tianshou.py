@@ -19,9 +19,11 @@ from typing import Any
 
 import numpy as np
 from pettingzoo.utils import parallel_to_aec
-from tianshou.env.pettingzoo_env import PettingZooEnv
 
-from fleet.env.adapters.arguments import Env, check_env
+from fleet.env.adapters.arguments import Env, check_env, imported_trainer
+
+with imported_trainer("tianshou", "constraints/tianshou.txt"):
+    from tianshou.env.pettingzoo_env import PettingZooEnv
 
 
 class TianshouEnv(PettingZooEnv):

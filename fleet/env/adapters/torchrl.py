@@ -33,15 +33,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
 from torch import Size
-from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
 
-from fleet.env.adapters.arguments import ARM_INFOS, TEAM_INFOS, Infos, check_batch
+from fleet.env.adapters.arguments import ARM_INFOS, TEAM_INFOS, Infos, check_batch, imported_trainer
 from fleet.env.random_actions import pick_legal
 from fleet.env.validation import seed_of, switch
 from fleet.env.vector import BatchEnv, Obs
+
+with imported_trainer("learn", "constraints.txt"):
+    from tensordict import TensorDict, TensorDictBase
+    from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+    from torchrl.envs import EnvBase
 
 GROUP = "arms"
 ENDS = ("done", "terminated", "truncated")

@@ -34,7 +34,7 @@ def participant():
     )
     granter = Granter("arm_0", ARMS, JobBook(is_central=False), lambda *_: None, real_s=0.0)
     granter.add_jobs(JOBS)
-    membership = Membership(fleet=LiveFleet(arms=ARMS), choose=lambda observation, place: 0)
+    membership = Membership(fleet=LiveFleet(arms=ARMS), choose=lambda observation, arm_index: 0)
     participant = Participant(arm, granter, membership, boot=1, rng=Random(0))
     participant.set_present(frozenset(ARMS))
     for name in ARMS:
