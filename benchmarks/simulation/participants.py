@@ -55,6 +55,7 @@ class ArmProcess:
     Attributes:
         machine: Its machine since the last start.
         unsure: Jobs that it returned at a start without knowing whether the last cycle was done.
+        new_epoch: Whether it begins without the journals that its peers know.
     """
 
     def __init__(
@@ -64,6 +65,7 @@ class ArmProcess:
         self._capacity, self._membership = capacity, membership
         self.machine: SimulatedArm | None = None
         self.unsure: set[str] = set()
+        self.new_epoch = False
 
     def __call__(self, process: Process) -> ArmNode:
         link: Any = SimulatedClient(process)
@@ -93,7 +95,7 @@ class ArmProcess:
             estimator,
             clock,
             settings,
-            lambda arm: ConsensusNode(arm, membership, grants, boot=history.boot),
+            lambda arm: ConsensusNode(arm, membership, grants, boot=history.boot, new_epoch=self.new_epoch),
         )
 
 
