@@ -11,12 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.bus.protocol.auction import MOST_JOBS, JobSpec, Quote, Submission
+from fleet.bus.protocol.consensus import History
 from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, decode, encode
 from fleet.bus.protocol.operator import Cancel, ClearRequest, ControlRequest
 from fleet.job import reason_to_give_up
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.rounds import Round, closed_space, stated_spaces
 from fleet.live.book import JobBook
+from fleet.live.epochs import adopted
 from fleet.live.job_rules import PastJobs, admit
 from fleet.live.journal import ClockTick, CommitPermitted, JobsAccepted, SpaceTaken
 from fleet.live.records import BookRecord, ContactLost, ContactRegained, Granted, ShiftEnded
@@ -169,6 +171,19 @@ def test_a_late_report_of_a_finished_job_closes_a_newer_award():
     assert not book.open
     assert book.grant_of("1:a") is None
     assert book.status()[0].finished_s == 6.0
+
+
+@pytest.mark.parametrize("permitted", [False, True])
+def test_a_job_that_an_arm_finished_without_permission_here_is_one_that_an_older_copy_has_as_awarded(permitted):
+    """Whoever it was awarded to. With permission, the report of the arm may be on its way."""
+    book = ledger(spec("a"))
+    book.apply(award("a", arm="arm_1"))
+    if permitted:
+        book.apply(CommitPermitted("0:a", 2.0))
+    book.replay(adopted(book, History("arm_0", "", (spec("a"),))))
+    (status,) = book.status()
+    assert (status.state, status.arm) == (("finishing", "arm_1") if permitted else ("finished", "arm_0"))
+    assert bool(book.open) == permitted
 
 
 @pytest.mark.parametrize("before", [False, True])
