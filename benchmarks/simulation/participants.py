@@ -100,15 +100,21 @@ class ArmProcess:
 
 
 def auctioneer_process(
-    arms: tuple[str, ...], speed: float, allocate: Allocate, timing: Timing, excludes: Excludes
+    arms: tuple[str, ...],
+    speed: float,
+    allocate: Allocate,
+    timing: Timing,
+    excludes: Excludes,
+    name: str = AUCTIONEER,
+    **more: Any,
 ) -> Callable[[Process], AuctionNode]:
-    """Return what starts the auctioneer."""
+    """Return what starts the auctioneer, with `more` arguments of `AuctionNode`."""
 
     def build(process: Process) -> AuctionNode:
         link: Any = SimulatedClient(process)
         journal = _journal(process, "auction", BookRecord)
         return AuctionNode(
-            link, AUCTIONEER, journal, allocate=allocate, speed=speed, timing=timing, arms=arms, excludes=excludes
+            link, name, journal, allocate=allocate, speed=speed, timing=timing, arms=arms, excludes=excludes, **more
         )
 
     return build
