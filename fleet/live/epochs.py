@@ -19,7 +19,7 @@ from fleet.bus.protocol.consensus import History, HistoryRequest, JobOutcome, wi
 from fleet.errors import BusError
 from fleet.live.book import JobBook
 from fleet.live.job_rules import is_same_work
-from fleet.live.journal import EpochBegun, JobsAccepted
+from fleet.live.journal import CommitPermitted, EpochBegun, JobsAccepted
 from fleet.live.records import BookRecord, ClaimNumbered, Granted, HistoryAdopted, JobSettled
 
 REPLY_S = 1.0
@@ -110,8 +110,8 @@ def adopted(book: JobBook, history: History) -> list[BookRecord]:
     """Return what this participant takes over from an arm: jobs that it finished, and jobs that it or others have.
 
     An arm leases its awards at the auctioneer that gave them; arms without one name those to whom they have given
-    permission to commit. A job that an arm finished without permission to commit in this journal is one that an older
-    copy still has as awarded.
+    permission to commit. An older copy of a journal may have a job as awarded that an arm has finished since, or that
+    it, or another arm, has permission to commit.
     """
     records: list[BookRecord] = []
     if history.epoch and not book.epoch:
@@ -127,9 +127,14 @@ def adopted(book: JobBook, history: History) -> list[BookRecord]:
         records.append(HistoryAdopted(history.arm, unknown, book.time_s))
     done = {job.name for job in unknown}
     for award in history.awards:
-        if award.auctioneer != book.name or award.job.name in done or not is_open(award.job, "waiting"):
+        if award.auctioneer != book.name or award.job.name in done:
             continue
-        if book.grant_of(award.award) is None:
+        permitted = award.award in history.may_commit
+        states: tuple[JobState, ...] = ("waiting", "awarded") if permitted else ("waiting",)
+        if (grant := book.open.get(award.award)) is not None:
+            if permitted and not grant.may_commit:
+                records.append(CommitPermitted(award.award, book.time_s, award.cycles))
+        elif book.grant_of(award.award) is None and is_open(award.job, *states):
             records.append(JobsAccepted((award.job,), f"adopted from {history.arm}", book.time_s))
             records.append(_adopted_award(award, history, book.time_s))
     for outcome in history.committed:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.bus.protocol.auction import MOST_JOBS, JobSpec, Quote, Submission
+from fleet.bus.protocol.auction import MOST_JOBS, Award, JobSpec, Quote, Submission
 from fleet.bus.protocol.consensus import History
 from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, decode, encode
 from fleet.bus.protocol.operator import Cancel, ClearRequest, ControlRequest
@@ -184,6 +184,29 @@ def test_a_job_that_an_arm_finished_without_permission_here_is_one_that_an_older
     (status,) = book.status()
     assert (status.state, status.arm) == (("finishing", "arm_1") if permitted else ("finished", "arm_0"))
     assert bool(book.open) == permitted
+
+
+@pytest.mark.parametrize(
+    ("number", "arm", "permitted", "state", "has"),
+    [
+        (0, "arm_1", False, "awarded", "arm_1"),
+        (0, "arm_1", True, "finishing", "arm_1"),
+        (1, "arm_0", False, "awarded", "arm_1"),  # it goes back: its lease is not renewed
+        (1, "arm_0", True, "finishing", "arm_0"),
+    ],
+)
+def test_a_permission_to_commit_that_an_older_copy_lacks_is_adopted(number, arm, permitted, state, has):
+    """Of the award that the copy has, or of a later one to another arm."""
+    book = ledger(spec("a"))
+    book.name = "boss"
+    book.apply(award("a", arm="arm_1"))
+    held = Award(f"{number}:a", "r", "boss", "q", spec("a"), cycles=2)
+    history = History(arm, "", awards=(held,), may_commit=(held.award,) if permitted else ())
+    for _ in range(2):
+        book.replay(adopted(book, history))
+        (status,) = book.status()
+        assert (status.state, status.arm, len(book.open)) == (state, has, 1)
+    assert adopted(book, history) == []
 
 
 @pytest.mark.parametrize("before", [False, True])

@@ -35,7 +35,7 @@ from fleet.live.auction.node import AuctionNode
 from fleet.live.book import JobBook
 from fleet.live.epochs import kept_time_s
 from fleet.live.journal import EpochBegun, JobsAccepted, Journal
-from tests.live.simulated import LONG, SimulatedFleet, job, refused
+from tests.live.simulated import LONG, TIMING, SimulatedFleet, job, refused
 
 STATUS = keys.of_jobs("f", "status")
 
@@ -293,6 +293,28 @@ def test_an_older_copy_of_the_journal_learns_what_is_finished(one):
     one.until(lambda: one.is_everywhere("a", "finished") and one.is_everywhere("b", "finished"))
     one.run(3.0)
     assert one.finished == {"a": 1, "b": 1}
+
+
+def test_an_older_copy_of_the_journal_learns_of_a_permission_to_commit(fleet_of):
+    """Its arm is cut off in the last cycle, right after it was asked for its history: no other arm begins that one."""
+    fleet = fleet_of(alone=False)
+    disk = fleet.world.processes[AUCTIONEER].disk
+    fleet.submit(job("a", 2, **LONG))
+    fleet.until(lambda: bool(fleet.away))
+    (arm,), copy = fleet.away, deepcopy(disk.names)
+    fleet.until(lambda: bool(fleet.begun))
+    lose_journal(fleet)
+    disk.names = copy
+    fleet.lose("lease")
+    fleet.auctioneer()
+    fleet.until(lambda: arm in boss(fleet).auctioneer.rounds.present)
+    fleet.cut(arm)
+    fleet.until(lambda: fleet.states("a") == {"unfinished"})
+    fleet.run(3 * TIMING.lease_s)
+    assert not boss(fleet).book.waiting
+    fleet.cut()
+    fleet.until(lambda: fleet.is_everywhere("a", "finished"))
+    assert fleet.finished == {"a": 1}
 
 
 def test_fleet_time_continues_as_the_arms_have_kept_it_while_there_was_no_auctioneer(fleet_of):
