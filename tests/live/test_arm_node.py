@@ -36,7 +36,7 @@ from fleet.live.arm.node import IDLE_PERIOD_S, PLANNING_S, ArmConfig, ArmNode
 from fleet.live.clock import FleetClock
 from fleet.robot import JOINTS, ThermalLimits
 from tests.live.disk import Disk
-from tests.live.test_poison import Wire
+from tests.live.wire import Wire
 from tests.waiting import PATIENCE_S, wait_until
 
 LIMITS = ThermalLimits()

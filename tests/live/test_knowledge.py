@@ -33,7 +33,7 @@ from fleet.live.space import CellSpace, Sphere
 from fleet.observation import FIELDS, Observation
 from fleet.robot import JOINTS, ThermalLimits
 from scenarios.live.auctioneer import CentralAllocation, job_spec
-from tests.live.test_poison import Wire
+from tests.live.wire import Wire
 
 MAY_DIFFER = {
     "last_award": "a live fleet counts rounds, and there is a round only when a job can begin",
