@@ -527,11 +527,11 @@ def auctioneer() -> Auctioneer:
 
 def test_a_cancelled_job_gives_up_a_long_chain_that_waits_for_it_soon(auctioneer):
     """Each submission names its jobs last first, so that no job comes after the one that it waits for."""
-    auctioneer.submit(Submission((spec("0"),)), 0.0, 0.0)
+    auctioneer.submit(Submission((spec("0"),)), 0.0)
     last = 40 * MOST_JOBS
     for first in range(1, last, MOST_JOBS):
         chain = tuple(spec(str(i), str(i - 1)) for i in range(first, first + MOST_JOBS))
-        auctioneer.submit(Submission(chain[::-1]), 0.0, 0.0)
+        auctioneer.submit(Submission(chain[::-1]), 0.0)
     began_s = time.process_time()
     auctioneer.control(ControlRequest("r", Cancel("0")), 1.0)
     assert time.process_time() - began_s < SOON_S
@@ -553,10 +553,10 @@ def long_names() -> tuple[JobSpec, ...]:
 def test_why_jobs_are_not_accepted_fits_into_one_message(auctioneer, jobs):
     """The router drops what is larger, and who submits would never hear of it."""
     first = Submission(tuple(msgspec.structs.replace(each, after=()) for each in long_names()))
-    auctioneer.submit(first, 0.0, 0.0)
+    auctioneer.submit(first, 0.0)
     request = Submission(tuple(msgspec.structs.replace(each, dwell_s=7.0) for each in jobs))
     assert len(encode(request)) <= MOST_BYTES
-    reply = auctioneer.submit(request, 0.0, 0.0)
+    reply = auctioneer.submit(request, 0.0)
     assert len(encode(reply)) <= MOST_BYTES
     assert not any(each.accepted for each in reply.jobs)
 
