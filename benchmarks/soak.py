@@ -102,7 +102,7 @@ class Week:
             place = f"place {self._made % 997}"
             specs.append(JobSpec(f"job {self._made:07d}", "hold", (place,), due_s=due_s, expires=late))
         start_s = time.perf_counter()
-        reply = self.auctioneer.submit(Submission(tuple(specs), "soak"), now_s, now_s)
+        reply = self.auctioneer.submit(Submission(tuple(specs), "soak"), now_s)
         self.submit_s.append(time.perf_counter() - start_s)
         assert all(job.accepted for job in reply.jobs), reply
 

@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from benchmarks.simulation.world import Process, Sleep, World
-from fleet.bus.client import AnotherReplies, Replies
+from fleet.bus.client import AnotherReplies, Replies, add_reply
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.keys import channel_for
 from fleet.bus.protocol.messages import decode, encode, encoding
@@ -344,7 +344,7 @@ class _Query:
         self.replied.add(replier)
         self.left -= 1
         if reply is not None:
-            self.replies.messages[key] = reply
+            add_reply(self.replies.messages, key, reply)
             self.each(reply)
         elif refusal:
             self.replies.refused[key] = refusal

@@ -55,6 +55,7 @@ class ArmProcess:
     Attributes:
         machine: Its machine since the last start.
         unsure: Jobs that it returned at a start without knowing whether the last cycle was done.
+        new_epoch: Whether it begins without the journals that its peers know.
     """
 
     def __init__(
@@ -64,6 +65,7 @@ class ArmProcess:
         self._capacity, self._membership = capacity, membership
         self.machine: SimulatedArm | None = None
         self.unsure: set[str] = set()
+        self.new_epoch = False
 
     def __call__(self, process: Process) -> ArmNode:
         link: Any = SimulatedClient(process)
@@ -93,20 +95,26 @@ class ArmProcess:
             estimator,
             clock,
             settings,
-            lambda arm: ConsensusNode(arm, membership, grants, boot=history.boot),
+            lambda arm: ConsensusNode(arm, membership, grants, boot=history.boot, new_epoch=self.new_epoch),
         )
 
 
 def auctioneer_process(
-    arms: tuple[str, ...], speed: float, allocate: Allocate, timing: Timing, excludes: Excludes
+    arms: tuple[str, ...],
+    speed: float,
+    allocate: Allocate,
+    timing: Timing,
+    excludes: Excludes,
+    name: str = AUCTIONEER,
+    **more: Any,
 ) -> Callable[[Process], AuctionNode]:
-    """Return what starts the auctioneer."""
+    """Return what starts the auctioneer, with `more` arguments of `AuctionNode`."""
 
     def build(process: Process) -> AuctionNode:
         link: Any = SimulatedClient(process)
         journal = _journal(process, "auction", BookRecord)
         return AuctionNode(
-            link, AUCTIONEER, journal, allocate=allocate, speed=speed, timing=timing, arms=arms, excludes=excludes
+            link, name, journal, allocate=allocate, speed=speed, timing=timing, arms=arms, excludes=excludes, **more
         )
 
     return build

@@ -88,7 +88,9 @@ class Fleet:
         capacity: int = 1,
         allocate: Allocate = first_come,
         choose: Choose = first_legal,
+        **more: Any,
     ) -> None:
+        """Set up the processes; `more` is of the membership of arms without an auctioneer."""
         self.world, self.arms, self.alone, self.speed, self.excludes = world, arms, alone, speed, excludes
         self.begun: dict[str, int] = {}
         self.finished: dict[str, int] = {}
@@ -98,7 +100,7 @@ class Fleet:
         membership: Membership | None = None
         if alone:
             live = LiveFleet(arms=arms, limits=ThermalLimits(warning_c=80.0, error_c=95.0))
-            membership = Membership(fleet=live, choose=choose, slots=4, excludes=excludes, timing=timing)
+            membership = Membership(fleet=live, choose=choose, slots=4, excludes=excludes, timing=timing, **more)
         world.bus = Bus(world)
         self.builders = {name: ArmProcess(self, FIRST, speed, rate_hz, capacity, membership) for name in arms}
         for name in arms:

@@ -600,31 +600,31 @@ class _PendingQuery(Generic[Reply]):
             # Any: Zenoh's stubs do not state that a reply has either `ok` or `err`.
             error: Any = reply.err
             reason = "" if error is None else error.payload.to_bytes().decode(errors="replace")
-            _add(self._replies.refused, "?", "" if reason == "Timeout" else reason)
+            add_reply(self._replies.refused, "?", "" if reason == "Timeout" else reason)
             return
         key, sent_encoding = str(reply.ok.key_expr), str(reply.ok.encoding)
         kind = Refusal if sent_encoding == encoding(Refusal) else self._kind
         try:
             _, message = read_message(kind, key, sent_encoding, reply.ok.payload.to_bytes())
         except ValueError as error:
-            _add(self._replies.refused, key, str(error))
+            add_reply(self._replies.refused, key, str(error))
             self._client.reject(f"reply under '{key}'", error)
             return
         if isinstance(message, Refusal):
-            _add(self._replies.refused, key, message.reason)
+            add_reply(self._replies.refused, key, message.reason)
             self._replies.temporary |= message.temporary
         else:
-            _add(self._replies.messages, key, message)
+            add_reply(self._replies.messages, key, message)
             self._each(message)
 
     def _stop(self) -> None:
-        _add(self._replies.refused, "?", f"More than {self._most} replies to one query; no more are read.")
+        add_reply(self._replies.refused, "?", f"More than {self._most} replies to one query; no more are read.")
         self.token.cancel()  # and so calls `finish`
 
     def _complete(self) -> None:
         self._replies.took_s = time.monotonic() - self._start_s
         if self._arrived == 0 and self._replies.took_s >= self._timeout_s:  # a timeout of the router states none
-            _add(self._replies.refused, "?", "")
+            add_reply(self._replies.refused, "?", "")
         self._done(self._replies)
 
 
@@ -632,7 +632,7 @@ def _too_large(size: int) -> str:
     return f"The request has {size:,} bytes, and at most {MOST_BYTES:,} are allowed."
 
 
-def _add(table: dict[str, Entry], key: str, entry: Entry) -> None:
+def add_reply(table: dict[str, Entry], key: str, entry: Entry) -> None:
     """Add without replacing another entry: several may reply under one key, as two auctioneers do."""
     name, number = key, 1
     while name in table:

@@ -14,12 +14,12 @@ from statistics import median_high
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import MOST_JOBS, Award, JobSpec
+from fleet.bus.protocol.auction import MOST_JOBS, Award, JobSpec, JobState
 from fleet.bus.protocol.consensus import History, HistoryRequest, JobOutcome, with_finished
 from fleet.errors import BusError
 from fleet.live.book import JobBook
 from fleet.live.job_rules import is_same_work
-from fleet.live.journal import EpochBegun, JobsAccepted
+from fleet.live.journal import CommitPermitted, EpochBegun, JobsAccepted
 from fleet.live.records import BookRecord, ClaimNumbered, Granted, HistoryAdopted, JobSettled
 
 REPLY_S = 1.0
@@ -110,25 +110,31 @@ def adopted(book: JobBook, history: History) -> list[BookRecord]:
     """Return what this participant takes over from an arm: jobs that it finished, and jobs that it or others have.
 
     An arm leases its awards at the auctioneer that gave them; arms without one name those to whom they have given
-    permission to commit.
+    permission to commit. An older copy of a journal may have a job as awarded that an arm has finished since, or that
+    it, or another arm, has permission to commit.
     """
     records: list[BookRecord] = []
     if history.epoch and not book.epoch:
         records.append(EpochBegun(history.epoch))
 
-    def is_open(job: JobSpec) -> bool:
+    def is_open(job: JobSpec, *states: JobState) -> bool:
         if (entry := book.jobs.get(job.name)) is None:
             return job.name not in book.past
-        return entry.state == "waiting" and (entry.spec is None or is_same_work(entry.spec, job))
+        return entry.state in states and (entry.spec is None or is_same_work(entry.spec, job))
 
-    unknown = tuple(job for job in history.finished if is_open(job))
+    unknown = tuple(job for job in history.finished if is_open(job, "waiting", "awarded"))
     if unknown:
         records.append(HistoryAdopted(history.arm, unknown, book.time_s))
     done = {job.name for job in unknown}
     for award in history.awards:
-        if award.auctioneer != book.name or award.job.name in done or not is_open(award.job):
+        if award.auctioneer != book.name or award.job.name in done:
             continue
-        if book.grant_of(award.award) is None:
+        permitted = award.award in history.may_commit
+        states: tuple[JobState, ...] = ("waiting", "awarded") if permitted else ("waiting",)
+        if (grant := book.open.get(award.award)) is not None:
+            if permitted and not grant.may_commit:
+                records.append(CommitPermitted(award.award, book.time_s, award.cycles))
+        elif book.grant_of(award.award) is None and is_open(award.job, *states):
             records.append(JobsAccepted((award.job,), f"adopted from {history.arm}", book.time_s))
             records.append(_adopted_award(award, history, book.time_s))
     for outcome in history.committed:

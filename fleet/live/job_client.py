@@ -203,54 +203,33 @@ def query_statuses(
     Raises:
         BusError: as `BusClient.query`.
     """
-    _StatusReader(link, done, tuple(names), time.monotonic() + timeout_s, most).query()
+    key, until_s = keys.of_jobs(link.fleet, "status"), time.monotonic() + timeout_s
+    firsts, pages, jobs = list[Replies[Status]](), list[Status](), dict[str, JobStatus]()
 
+    def query(after: str = "") -> None:
+        left_s = max(PAGE_S, until_s - time.monotonic())
+        link.query(key, StatusRequest(tuple(names), after), Status, add, timeout_s=left_s)
 
-class _StatusReader:
-    """Reads the pages of one status request."""
-
-    def __init__(
-        self,
-        link: BusClient,
-        done: Callable[[Replies[Status]], None],
-        names: tuple[str, ...],
-        until_s: float,
-        most: int,
-    ) -> None:
-        self._link, self._done, self._names, self._until_s, self._most = link, done, names, until_s, most
-        self._replies = Replies[Status]()
-        """To the first request."""
-        self._pages: list[Status] = []
-        self._jobs: dict[str, JobStatus] = {}
-
-    def query(self, after: str = "") -> None:
-        """Query the first page, or the next one."""
-        key, request = keys.of_jobs(self._link.fleet, "status"), StatusRequest(self._names, after)
-        left_s = max(PAGE_S, self._until_s - time.monotonic())
-        self._link.query(key, request, Status, self._add, timeout_s=left_s)
-
-    def _add(self, replies: Replies[Status]) -> None:
-        if not self._pages:
-            self._replies = replies
+    def add(replies: Replies[Status]) -> None:
+        firsts.append(replies)
         page = next(iter(replies.messages.values()), None)
         if page is not None:
-            self._pages.append(page)
-            self._jobs |= {status.job: status for status in page.jobs}
-        if page is not None and page.next and page.jobs and self._may_query():
-            try:
-                self.query(page.next)
-                return
-            except BusError as error:
-                _LOG.warning("%s", error)
-        if self._pages:
-            messages = self._replies.messages
-            jobs, last = tuple(self._jobs.values()), self._pages[-1]
-            messages[next(iter(messages))] = replace(self._pages[0], jobs=jobs, counts=last.counts, next=last.next)
-        self._done(self._replies)
+            pages.append(page)
+            jobs.update({status.job: status for status in page.jobs})
+            is_wanted = len(pages) < MAX_PAGES and len(jobs) < most and time.monotonic() < until_s
+            if page.next and page.jobs and is_wanted:
+                try:
+                    query(page.next)
+                    return
+                except BusError as error:
+                    _LOG.warning("%s", error)
+        if pages:
+            messages, last = firsts[0].messages, pages[-1]
+            whole = replace(pages[0], jobs=tuple(jobs.values()), counts=last.counts, next=last.next)
+            messages[next(iter(messages))] = whole
+        done(firsts[0])
 
-    def _may_query(self) -> bool:
-        is_in_time = time.monotonic() < self._until_s
-        return is_in_time and len(self._pages) < MAX_PAGES and len(self._jobs) < self._most
+    query()
 
 
 def _progress(status: JobStatus) -> tuple[object, ...]:

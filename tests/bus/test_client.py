@@ -27,7 +27,7 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, State, decode, encode, encoding
 from fleet.bus.protocol.operator import ResetReply, ResetRequest
-from fleet.bus.router import Router
+from fleet.bus.router import Router, other_versions
 from fleet.errors import BusError
 from fleet.live.supervisor import Supervisor
 from tests import commands
@@ -306,6 +306,15 @@ def test_who_comes_and_goes_is_seen(bus):
     arm.close()
     serve_until(lambda: ("arm_0", False) in seen, watcher)
     assert seen.index(("arm_0", True)) < seen.index(("arm_0", False))
+
+
+def test_an_arm_of_an_older_version_is_named_with_its_version(bus):
+    arm = bus()
+    arm.declare_token(keys.of_arm("f", "arm 2", "alive"))
+    token = raw(arm).liveliness().declare_token("thermofleet/v2/f/arm/arm%201/alive")
+    (sentence,) = other_versions(arm._endpoint, "f")
+    token.undeclare()
+    assert sentence.startswith("'arm 1' uses version v2 of the bus, and this program v4")
 
 
 def test_what_nobody_handles_pushes_out_the_oldest(bus):

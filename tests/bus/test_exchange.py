@@ -21,7 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.bus.exchange.channel import PERFECT, Channel, Partition
-from fleet.bus.exchange.memory import UNHEARD, Broadcast, Delivery, Exchange, PeerView
+from fleet.bus.exchange.memory import UNHEARD, Broadcast, Exchange, PeerView
 from fleet.bus.exchange.zenoh import ZenohExchange, messages_of
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import DifficultyScores, State, decode, encode
@@ -139,17 +139,18 @@ THREE = ("a", "b", "c")
 DT_S = 10.0
 
 
-def carry(delivery: Delivery, now_s: float, said_s: list[float]) -> np.ndarray:
+def carry(exchange: Exchange, now_s: float, said_s: list[float]) -> np.ndarray:
     """The times at which the words that every arm now has were said, [receiver, sender]; −inf for none."""
     said_s.append(now_s)
-    return np.array([*said_s, -np.inf])[delivery.carry(now_s)]
+    return np.array([*said_s, -np.inf])[exchange._carry(now_s)]
 
 
-def shift(channel: Channel, ticks: int, seed: int = 0, arms: tuple[str, ...] = THREE) -> tuple[Delivery, np.ndarray]:
-    """A delivery after so many ticks, and the times of the words known after each, [tick, receiver, sender]."""
-    delivery = Delivery(arms, channel, np.random.default_rng(seed))
+def shift(channel: Channel, ticks: int, seed: int = 0, arms: tuple[str, ...] = THREE) -> tuple[Exchange, np.ndarray]:
+    """An exchange after so many ticks, and the times of the words known after each, [tick, receiver, sender]."""
+    exchange = Exchange(arms, channel)
+    exchange.begin(np.random.default_rng(seed))
     said_s: list[float] = []
-    return delivery, np.array([carry(delivery, DT_S * tick, said_s) for tick in range(ticks)])
+    return exchange, np.array([carry(exchange, DT_S * tick, said_s) for tick in range(ticks)])
 
 
 channels = st.builds(
@@ -164,7 +165,7 @@ channels = st.builds(
 
 @given(channels, st.integers(0, 100))
 def test_what_is_known_never_grows_older_by_a_word_and_never_comes_before_its_time(channel, seed):
-    delivery, known = shift(channel, 15, seed)
+    exchange, known = shift(channel, 15, seed)
     now_s = DT_S * np.arange(15)[:, None, None]
     others = ~np.eye(3, dtype=bool)
     for earlier, later in pairwise(known):
@@ -172,7 +173,7 @@ def test_what_is_known_never_grows_older_by_a_word_and_never_comes_before_its_ti
     assert ((now_s - known)[:, others] >= channel.delay_s).all()
     assert (known[:, ~others] == now_s[:, 0]).all()  # one's own word is known at once
     assert np.isneginf(known[:, ~channel.links(THREE) & others]).all()
-    assert delivery.delivered + delivery.late <= 15 * channel.links(THREE).sum()
+    assert exchange.delivered + exchange.late <= 15 * channel.links(THREE).sum()
 
 
 @given(st.sampled_from([0.0, 3.0, 10.0, 25.0]), st.sampled_from([1.0, 10.0, 35.0]), st.integers(0, 100))
@@ -188,10 +189,10 @@ def test_without_loss_a_word_is_there_after_delay_and_jitter_at_the_latest(delay
 def test_jitter_is_uniform():
     """A word that takes 0 to m ticks is there after n of them with probability n/m."""
     m, links = 20, 90
-    delivery, _ = shift(Channel(jitter_s=m * DT_S), m // 2 + 1, arms=tuple("abcdefghij"))
+    exchange, _ = shift(Channel(jitter_s=m * DT_S), m // 2 + 1, arms=tuple("abcdefghij"))
     shares = [n / m for n in range(m // 2 + 1)]
     spread = np.sqrt(links * sum(p * (1 - p) for p in shares))
-    assert abs(delivery.delivered - links * sum(shares)) < 5 * spread
+    assert abs(exchange.delivered - links * sum(shares)) < 5 * spread
 
 
 def test_more_loss_loses_the_same_words_and_more_and_jitter_loses_no_others():
@@ -225,20 +226,20 @@ def test_partitions_cut_for_their_time_and_may_overlap():
 
 def test_a_word_under_way_when_the_link_is_cut_is_lost_and_one_said_just_before_it_heals_too():
     """Delay 20 s, cut from 30 to 50 s: what is said in [10, 50) would travel while it is cut."""
-    delivery, known = shift(Channel(delay_s=20.0, partitions=(Partition(30.0, 50.0, (("a",),)),)), 9, arms=("a", "b"))
+    exchange, known = shift(Channel(delay_s=20.0, partitions=(Partition(30.0, 50.0, (("a",),)),)), 9, arms=("a", "b"))
     assert known[:, 0, 1].tolist() == [-np.inf, -np.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 50.0, 60.0]
-    assert delivery.late == 2 * 4
+    assert exchange.late == 2 * 4
 
 
 def test_a_new_episode_forgets_what_was_known_and_what_was_on_its_way():
-    delivery = Delivery(THREE, Channel(delay_s=20.0))
+    exchange = Exchange(THREE, Channel(delay_s=20.0))
     for time_s in (-20.0, -10.0, 0.0):
-        delivery.carry(time_s)
-    delivery.begin()
+        exchange._carry(time_s)
+    exchange.begin()
     others, said_s = ~np.eye(3, dtype=bool), list[float]()
     for time_s in (0.0, 10.0):
-        assert np.isneginf(carry(delivery, time_s, said_s)[others]).all()
-    assert (carry(delivery, 20.0, said_s)[others] == 0.0).all()
+        assert np.isneginf(carry(exchange, time_s, said_s)[others]).all()
+    assert (carry(exchange, 20.0, said_s)[others] == 0.0).all()
 
 
 def make_words(rng: np.random.Generator, arms: int, time_s: float, slots: int = 4) -> Broadcast:
@@ -465,7 +466,7 @@ def test_a_process_ends_however_it_leaves_the_exchange(ending):
     """A Zenoh session that is not closed keeps a process from ending."""
     program = f"""
 import numpy as np
-from fleet.bus.exchange.memory import UNHEARD, Broadcast, Delivery, Exchange, PeerView
+from fleet.bus.exchange.memory import UNHEARD, Broadcast, Exchange, PeerView
 from fleet.bus.exchange.zenoh import ZenohExchange
 bus = ZenohExchange(["a", "b"], "f", timeout_s=120.0)
 one, plan = np.ones((2, 1)), np.ones((2, 1, 1))

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from benchmarks.simulation.participants import AUCTIONEER, CLIENT
-from benchmarks.simulation.simulated_fleet import Fleet
+from benchmarks.simulation.participants import AUCTIONEER, CLIENT, auctioneer_process
+from benchmarks.simulation.simulated_fleet import Fleet, first_come
 from benchmarks.simulation.world import Process, World
 from fleet.bus.client import NoReply
 from fleet.bus.protocol import keys
@@ -31,11 +31,18 @@ class SimulatedFleet(Fleet):
     """A fleet with an auctioneer, or without one; every started arm is on the bus."""
 
     def __init__(
-        self, alone: bool, arms: int = 3, *, excludes: Excludes = no_conflicts, seed: int = 0, **options: Any
+        self,
+        alone: bool,
+        arms: int = 3,
+        *,
+        excludes: Excludes = no_conflicts,
+        seed: int = 0,
+        trace: bool = False,
+        **options: Any,
     ) -> None:
         names = tuple(f"arm_{number}" for number in range(arms))
         options = {"speed": SPEED, "timing": TIMING, **options}
-        super().__init__(World(seed), names, alone=alone, excludes=excludes, **options)
+        super().__init__(World(seed, trace=trace), names, alone=alone, excludes=excludes, **options)
         self._requests = 0
         self.published: list[Any] = []
         """All published messages, in order."""
@@ -59,6 +66,20 @@ class SimulatedFleet(Fleet):
         for name in names or (self.arms if self.alone else (AUCTIONEER,)):
             self.world.processes[name].kill("is killed")
             self.world.processes[name].start()
+
+    def auctioneer(self, process: str = AUCTIONEER, **options: Any) -> None:
+        """Start an auctioneer, in place of one that runs in this process, with these options of `AuctionNode`."""
+        build = auctioneer_process(self.arms, self.speed, first_come, TIMING, self.excludes, **options)
+        if process in self.world.processes:
+            self.world.processes[process].kill("is killed")
+            self.world.processes[process]._build = build
+        else:
+            Process(self.world, process, build)
+        self.world.processes[process].start()
+
+    def logged(self, part: str) -> list[str]:
+        """Lines of the trace with this part, from there on."""
+        return [line[line.index(part) :] for line in self.world.trace or () if part in line]
 
     def stop(self, arm: str) -> None:
         """Stop an arm as by SIGSTOP, for ever."""

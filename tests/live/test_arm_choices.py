@@ -1,6 +1,8 @@
 """Which arm gets which job in a fleet without an auctioneer: choices of arms by their policies, grants, epochs."""
 
 import random
+import re
+from contextlib import nullcontext
 from functools import partial
 from itertools import islice
 
@@ -11,11 +13,15 @@ from hypothesis import strategies as st
 from agents.auction import Consensus
 from agents.registry import RULES
 from benchmarks.simulation.machine import SimulatedEstimator
-from benchmarks.simulation.participants import simulated_system
+from benchmarks.simulation.participants import CLIENT, simulated_system
 from benchmarks.simulation.simulated_fleet import FIRST
+from fleet.bus.client import AnotherReplies
 from fleet.bus.protocol.auction import Ack, Award
 from fleet.bus.protocol.keys import of_arm
-from tests.live.simulated import SimulatedFleet, job, refused
+from fleet.errors import BusError
+from fleet.live.consensus.node import ConsensusNode
+from scenarios.live.arm import refuse_auctioneer
+from tests.live.simulated import SPEED, SimulatedFleet, job, refused
 from tests.profiles import examples
 
 ARM_POLICIES = [name for name, rule in RULES.items() if rule.scope == "arm"]
@@ -130,3 +136,99 @@ def test_an_auctioneer_may_not_award_jobs_to_such_an_arm(fleet_of):
     assert "allocate jobs together with my peers" in refused(
         lambda: fleet.ask(of_arm("f", "arm_0", "award"), award, Ack)
     )
+
+
+# Starts, restarts and ends
+
+
+def begun(fleet: SimulatedFleet, *arms: str) -> bool:
+    return all(fleet.node(arm).work_source._begun for arm in arms or fleet.arms)
+
+
+def test_an_arm_does_not_start_where_an_auctioneer_is_present(fleet):
+    link = fleet.world.processes[CLIENT].client
+    with nullcontext() if fleet.alone else pytest.raises(BusError, match="has an auctioneer: 'auctioneer'"):
+        refuse_auctioneer(link)
+
+
+def test_a_restarted_arm_knows_its_peers_before_it_replies_for_them(fleet_of):
+    """`arm_0` replies for the fleet, also if the bid of a peer begins the fleet's time of a restarted arm first."""
+    fleet = fleet_of(True)
+    fleet.until(lambda: begun(fleet))
+    fleet.restart("arm_2")
+    restarted = fleet.node("arm_2").work_source
+    assert not restarted._tokens
+    restarted._begun = True
+
+    def check() -> None:
+        with pytest.raises(AnotherReplies):
+            restarted._check_first()
+
+    fleet.call("arm_2", check)
+
+
+def test_an_arm_that_comes_later_takes_the_epoch_of_the_others_though_it_is_the_first_by_name(fleet_of, monkeypatch):
+    """And though its first request to them is lost, and it gets their replies to the next one before a bid."""
+    fleet = fleet_of(True, only=("arm_1", "arm_2"))
+    fleet.until(lambda: begun(fleet, "arm_1", "arm_2"))
+    monkeypatch.setattr(ConsensusNode, "_apply_bid", lambda *_: None)
+    with monkeypatch.context() as first:
+        first.setattr(fleet.world, "send", fleet.world.send)
+        fleet.lose("history")
+        fleet.world.processes["arm_0"].start()
+    fleet.until(lambda: begun(fleet, "arm_0"))
+    assert len({fleet.node(arm).work_source.book.epoch for arm in fleet.arms}) == 1
+
+
+def test_jobs_of_a_common_stream_are_done_until_the_end_of_the_shift_and_others_reported_unfinished(fleet_of):
+    stream = ((0.0, job("brief", 3)), (10.0, job("later", 3)), (0.0, job("long", 10_000)))
+    fleet = fleet_of(True, stream=stream, horizon_s=600.0)
+
+    def over() -> list[bool]:
+        ends: list[bool] = []
+        for arm in fleet.arms:
+            fleet.call(arm, lambda arm=arm: ends.append(fleet.node(arm).work_source.over))
+        return ends
+
+    assert not any(over())
+    fleet.until(lambda: all(over()), 120.0)
+    times_s = [fleet.node(arm).clock.now_s(fleet.world.processes[arm].real_s) for arm in fleet.arms]
+    assert max(times_s) - min(times_s) < 0.5 * SPEED
+    for known in fleet.known():
+        assert {name: each.state for name, each in known.items()} == {
+            "brief": "finished",
+            "later": "finished",
+            "long": "unfinished",
+        }
+        assert known["long"].reason == "The shift ended before it was done."
+    assert not any(fleet.node(arm).executor.active for arm in fleet.arms)
+    assert fleet.finished == {"brief": 1, "later": 1}
+
+
+def test_an_arm_that_lost_its_journals_does_not_join_unless_a_person_requests_it(fleet_of):
+    fleet = fleet_of(True)
+    processes, trace = fleet.world.processes, list[str]()
+    fleet.submit(job("a", 2), job("b", 2), job("long", 2000))
+    fleet.until(lambda: all(fleet.is_everywhere(name, "finished") for name in "ab") and bool(fleet.holder("long")))
+    lost = next(arm for arm in fleet.arms if arm != fleet.holder("long"))
+    for arm in fleet.arms:
+        processes[arm].kill("is killed")
+    processes[lost].disk.names.clear()
+    fleet.world.bus.on_publish = lambda *_: None  # its events begin their numbers again
+    fleet.world.trace = trace
+    for arm in sorted(fleet.arms, key=lambda arm: arm != lost):  # it takes part only when it knows what they know
+        processes[arm].start()
+    fleet.until(lambda: not processes[lost].up)
+    assert re.search(r"exits: 'arm_\d' knows claims of 'arm_\d'.*2 finished job\(s\).*--new-epoch", "\n".join(trace))
+    processes[lost].disk.names.clear()
+    fleet.builders[lost].new_epoch = True
+    processes[lost].start()
+    fleet.until(lambda: begun(fleet, lost))
+    assert all(map(fleet.node(lost).work_source.book.is_settled, "ab"))
+    fleet.submit(job("a", 2), job("c", 2))
+    fleet.until(lambda: fleet.is_everywhere("c", "finished"))
+    fleet.builders[lost].new_epoch = False
+    fleet.restart(lost)  # with the same journals again
+    fleet.submit(job("d", 2))
+    fleet.until(lambda: fleet.is_everywhere("d", "finished"))
+    assert fleet.finished == dict.fromkeys("abcd", 1)

@@ -41,7 +41,7 @@ class Shop:
         options: Any = {"keep": lambda *_: None, "boot": "1", "real_s": 0.0, "timing": TIMING}
         self.auctioneer = Auctioneer("x", book, allocate=first_bid, **options)
         self.auctioneer.set_present(frozenset(arms))
-        self.auctioneer.submit(Submission(jobs), 0.0, 0.0)
+        self.auctioneer.submit(Submission(jobs), 0.0)
 
     def run(self, seconds: float) -> None:
         end_s = self.real_s + seconds

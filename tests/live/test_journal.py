@@ -31,7 +31,8 @@ from fleet.live.epochs import describe, history_of
 from fleet.live.journal import CommitPermitted, CompactingJournal, JobsAccepted, Journal, Started, TimeRecorder
 from fleet.live.records import BookRecord, JobSettled
 from scenarios.live.arm import restart_history
-from tests.live.test_poison import Arm, Wire
+from tests.live.test_poison import Arm
+from tests.live.wire import Wire
 from tests.profiles import examples
 
 ROOT = Path(__file__).parents[2]

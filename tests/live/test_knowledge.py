@@ -33,7 +33,7 @@ from fleet.live.space import CellSpace, Sphere
 from fleet.observation import FIELDS, Observation
 from fleet.robot import JOINTS, ThermalLimits
 from scenarios.live.auctioneer import CentralAllocation, job_spec
-from tests.live.test_poison import Wire
+from tests.live.wire import Wire
 
 MAY_DIFFER = {
     "last_award": "a live fleet counts rounds, and there is a round only when a job can begin",
@@ -105,7 +105,7 @@ class LiveShift:
         rules = {"allocate": allocate, "timing": timing, "excludes": self.excludes}
         ledger = JobBook(arms=NAMES)
         self.auctioneer = Auctioneer("x", ledger, keep=lambda *_: None, boot="1", real_s=0.0, **rules)
-        self.auctioneer.submit(Submission(self.jobs), 0.0, 0.0)
+        self.auctioneer.submit(Submission(self.jobs), 0.0)
         self.wires = {name: KeepingWire() for name in NAMES}
         self.nodes = {name: self.node(arm, world) for name, arm in zip(NAMES, arms, strict=True)}
 

@@ -10,13 +10,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.bus.protocol.auction import MOST_JOBS, JobSpec, Quote, Submission
+from fleet.bus.protocol.auction import MOST_JOBS, Award, JobSpec, Quote, Submission
+from fleet.bus.protocol.consensus import History
 from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, decode, encode
 from fleet.bus.protocol.operator import Cancel, ClearRequest, ControlRequest
 from fleet.job import reason_to_give_up
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.rounds import Round, closed_space, stated_spaces
 from fleet.live.book import JobBook
+from fleet.live.epochs import adopted
 from fleet.live.job_rules import PastJobs, admit
 from fleet.live.journal import ClockTick, CommitPermitted, JobsAccepted, SpaceTaken
 from fleet.live.records import BookRecord, ContactLost, ContactRegained, Granted, ShiftEnded
@@ -169,6 +171,42 @@ def test_a_late_report_of_a_finished_job_closes_a_newer_award():
     assert not book.open
     assert book.grant_of("1:a") is None
     assert book.status()[0].finished_s == 6.0
+
+
+@pytest.mark.parametrize("permitted", [False, True])
+def test_a_job_that_an_arm_finished_without_permission_here_is_one_that_an_older_copy_has_as_awarded(permitted):
+    """Whoever it was awarded to. With permission, the report of the arm may be on its way."""
+    book = ledger(spec("a"))
+    book.apply(award("a", arm="arm_1"))
+    if permitted:
+        book.apply(CommitPermitted("0:a", 2.0))
+    book.replay(adopted(book, History("arm_0", "", (spec("a"),))))
+    (status,) = book.status()
+    assert (status.state, status.arm) == (("finishing", "arm_1") if permitted else ("finished", "arm_0"))
+    assert bool(book.open) == permitted
+
+
+@pytest.mark.parametrize(
+    ("number", "arm", "permitted", "state", "has"),
+    [
+        (0, "arm_1", False, "awarded", "arm_1"),
+        (0, "arm_1", True, "finishing", "arm_1"),
+        (1, "arm_0", False, "awarded", "arm_1"),  # it goes back: its lease is not renewed
+        (1, "arm_0", True, "finishing", "arm_0"),
+    ],
+)
+def test_a_permission_to_commit_that_an_older_copy_lacks_is_adopted(number, arm, permitted, state, has):
+    """Of the award that the copy has, or of a later one to another arm."""
+    book = ledger(spec("a"))
+    book.name = "boss"
+    book.apply(award("a", arm="arm_1"))
+    held = Award(f"{number}:a", "r", "boss", "q", spec("a"), cycles=2)
+    history = History(arm, "", awards=(held,), may_commit=(held.award,) if permitted else ())
+    for _ in range(2):
+        book.replay(adopted(book, history))
+        (status,) = book.status()
+        assert (status.state, status.arm, len(book.open)) == (state, has, 1)
+    assert adopted(book, history) == []
 
 
 @pytest.mark.parametrize("before", [False, True])
@@ -489,11 +527,11 @@ def auctioneer() -> Auctioneer:
 
 def test_a_cancelled_job_gives_up_a_long_chain_that_waits_for_it_soon(auctioneer):
     """Each submission names its jobs last first, so that no job comes after the one that it waits for."""
-    auctioneer.submit(Submission((spec("0"),)), 0.0, 0.0)
+    auctioneer.submit(Submission((spec("0"),)), 0.0)
     last = 40 * MOST_JOBS
     for first in range(1, last, MOST_JOBS):
         chain = tuple(spec(str(i), str(i - 1)) for i in range(first, first + MOST_JOBS))
-        auctioneer.submit(Submission(chain[::-1]), 0.0, 0.0)
+        auctioneer.submit(Submission(chain[::-1]), 0.0)
     began_s = time.process_time()
     auctioneer.control(ControlRequest("r", Cancel("0")), 1.0)
     assert time.process_time() - began_s < SOON_S
@@ -515,10 +553,10 @@ def long_names() -> tuple[JobSpec, ...]:
 def test_why_jobs_are_not_accepted_fits_into_one_message(auctioneer, jobs):
     """The router drops what is larger, and who submits would never hear of it."""
     first = Submission(tuple(msgspec.structs.replace(each, after=()) for each in long_names()))
-    auctioneer.submit(first, 0.0, 0.0)
+    auctioneer.submit(first, 0.0)
     request = Submission(tuple(msgspec.structs.replace(each, dwell_s=7.0) for each in jobs))
     assert len(encode(request)) <= MOST_BYTES
-    reply = auctioneer.submit(request, 0.0, 0.0)
+    reply = auctioneer.submit(request, 0.0)
     assert len(encode(reply)) <= MOST_BYTES
     assert not any(each.accepted for each in reply.jobs)
 

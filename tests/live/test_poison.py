@@ -7,8 +7,7 @@ import gc
 import json
 import threading
 import time
-from collections import defaultdict
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from copy import deepcopy
 from pathlib import Path
 
@@ -23,7 +22,6 @@ from agents.auction import Consensus
 from docs.bus_contract import EXAMPLES
 from fleet.arm.planner import Planner
 from fleet.arm.time_limit import check_time
-from fleet.bus.client import AnotherReplies, Replies
 from fleet.bus.protocol.auction import (
     Ack,
     Award,
@@ -54,9 +52,8 @@ from fleet.bus.protocol.consensus import (
     HistoryRequest,
     JobOutcome,
 )
-from fleet.bus.protocol.messages import MalformedMessage, State, decode, encode
+from fleet.bus.protocol.messages import State, encode
 from fleet.bus.protocol.operator import Cancel, Change, ClearRequest, ControlRequest, Operation, Pause, Resume, Settle
-from fleet.errors import Refused
 from fleet.job import Place
 from fleet.live.arm.awards import ArmHistory, ArmRecord, AwardExecutor
 from fleet.live.arm.body import SimulatedBody
@@ -72,6 +69,7 @@ from fleet.live.journal import Journal
 from fleet.live.records import BookRecord
 from fleet.motion import Plan
 from fleet.robot import ThermalLimits
+from tests.live.wire import Wire
 from tests.profiles import examples
 from tests.waiting import PATIENCE_S
 
@@ -86,65 +84,6 @@ ODD = st.one_of(
     ),
     st.sampled_from(["", "x", "\u202e", "a\0b", "x" * 9000, [], {}, [[]] * 9, [1e308] * 7]),
 )
-
-
-class Wire:
-    """The bus of one participant without a network; messages to it are given as bytes."""
-
-    fleet = "f"
-
-    def __init__(self, other=None):
-        self.handlers, self.peers = {}, [other] if other else []
-        self.replies = defaultdict(list)
-        """Bodies that the next queries for a kind of reply get."""
-        self.sent = []
-
-    def publisher(self, key, kind):
-        return lambda message: self.sent.append(encode(message)[:0])
-
-    def publish(self, key, message):
-        encode(message)
-
-    def reply_to(self, key, kind, handle):
-        self.handlers[kind] = handle
-
-    def subscribe(self, expression, kind, handle, **options):
-        self.handlers[kind] = lambda message: handle(getattr(message, "arm", "arm_0"), message)
-
-    def watch_tokens(self, expression, handle):
-        if "/arm/" in expression:
-            handle("arm_0", True)
-
-    def declare_token(self, key):
-        pass
-
-    def tokens(self, expression):
-        return frozenset()
-
-    def query(self, key, request, kind, done, *, timeout_s, each=lambda reply: None):
-        replies = Replies()
-        for body in self.replies.pop(kind, []):
-            with suppress(MalformedMessage):
-                message = decode(kind, body)
-                replies.messages[key] = message
-                each(message)
-        encode(request)
-        done(replies)
-
-    def query_and_wait(self, key, request, kind, *, timeout_s):
-        return Replies()
-
-    def serve(self, until_s=0.0):
-        return 0
-
-    def take(self, kind, body):
-        """Handle a request or a publication as the client does."""
-        with suppress(Refused, AnotherReplies, MalformedMessage):
-            reply = self.handlers[kind](decode(kind, body))
-            if reply is not None:
-                encode(reply)
-                return reply
-        return None
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,6 @@
 """The status of more jobs than one message has: in pages, with the most urgent jobs first."""
 
 from collections import Counter
-from functools import partial
 from typing import Any, get_args
 
 import pytest
@@ -9,17 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.simulation.participants import CLIENT
-from fleet.bus.client import BusClient
+from fleet.bus.client import Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import MOST_JOBS, JobSpec, JobState, Status, StatusRequest
 from fleet.bus.protocol.messages import MOST_BYTES, encode
-from fleet.bus.router import Router
 from fleet.errors import Refused
 from fleet.live import job_client
 from fleet.live.job_client import query_statuses
 from fleet.live.records import JobEntry
 from tests.live.many_jobs import ManyJobs, entries
-from tests.waiting import PATIENCE_S, serving, wait_until
+from tests.waiting import PATIENCE_S
 
 STATES = get_args(JobState)
 STATUS = keys.of_jobs("f", "status")
@@ -120,36 +118,37 @@ def test_every_kind_of_fleet_tells_the_state_of_all_jobs_and_why_they_wait(fleet
     assert sum(each.state == "waiting" and bool(each.reason) for each in status.jobs) == status.counts["waiting"]
 
 
-@pytest.fixture
-def many():
-    """A client, and a participant with 400 jobs that it serves on a thread."""
-    with Router() as router, BusClient(router.endpoint, "f") as link, BusClient(router.endpoint, "f") as other:
-        desk = ManyJobs(*entries(399), *entries(1, "unfinished"))
-        desk.reply_on(other)
-        with serving(other):
-            yield link, desk
+class Link:
+    """A link to one participant that replies at once, without a network."""
+
+    fleet = "f"
+
+    def __init__(self, reply):
+        self._reply = reply
+
+    def query(self, key, request, kind, done, *, timeout_s):
+        try:
+            done(Replies({key: self._reply(request)}))
+        except Refused as refusal:
+            done(Replies(refused={key: str(refusal)}))
 
 
-def read_all(link, names=(), **options):
-    query = partial(query_statuses, link, names=names, timeout_s=PATIENCE_S, **options)
-    # The router may not know the other client's queryable yet.
-    return wait_until(lambda: (found := link.wait(query, PATIENCE_S)).messages and found).first(STATUS)
+def read_all(reply, names=(), **options) -> Status:
+    replies = []
+    query_statuses(Link(reply), replies.append, names, timeout_s=PATIENCE_S, **options)
+    return replies[0].first(STATUS)
 
 
-def test_a_client_reads_all_pages_as_one_reply(many):
-    link, desk = many
-    status = read_all(link)
+def test_a_client_reads_all_pages_as_one_reply_and_stops_after_enough_jobs_or_pages(monkeypatch):
+    desk = ManyJobs(*entries(399), *entries(1, "unfinished"))
+    status = read_all(desk.reply)
     assert (len(status.jobs), status.next, status.jobs[0].state) == (400, "", "unfinished")
     assert status.counts == {"finished": 399, "unfinished": 1}
-    assert len(read_all(link, [*desk.entries][:300]).jobs) == 300
-
-
-def test_a_client_stops_after_enough_jobs_or_pages(many, monkeypatch):
-    link, _ = many
-    status = read_all(link, most=129)
+    assert len(read_all(desk.reply, [*desk.entries][:300]).jobs) == 300
+    status = read_all(desk.reply, most=129)
     assert (len(status.jobs), status.next != "") == (256, True)
     monkeypatch.setattr(job_client, "MAX_PAGES", 1)
-    assert len(read_all(link).jobs) == MOST_JOBS
+    assert len(read_all(desk.reply).jobs) == MOST_JOBS
 
 
 def test_a_client_has_what_arrived_if_a_page_is_refused():
@@ -162,8 +161,5 @@ def test_a_client_has_what_arrived_if_a_page_is_refused():
         return first
 
     for reply, count in ((refuse, 2), (lambda _: first, 2), (lambda _: Status("au", 1.0, (), next="3 1.0 x"), 0)):
-        with Router() as router, BusClient(router.endpoint, "f") as link, BusClient(router.endpoint, "f") as other:
-            other.reply_to(STATUS, StatusRequest, reply)
-            with serving(other):
-                status = read_all(link)
+        status = read_all(reply)
         assert (len(status.jobs), status.next) == (count, "3 1.0 x")

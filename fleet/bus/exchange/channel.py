@@ -1,6 +1,6 @@
 """Communication channels between arms: topology, delay, loss and partitions.
 
-A channel is a value; `fleet.bus.exchange.memory.Delivery` applies it.
+A channel is a value; `fleet.bus.exchange.memory.Exchange` applies it.
 """
 
 import math

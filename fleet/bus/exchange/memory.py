@@ -70,19 +70,17 @@ class PeerView:
 class Exchange:
     """Shares broadcasts in memory through a channel, on the time of the broadcasts.
 
+    A lost broadcast is not sent again: its receiver keeps the last one. A broadcast that arrives after a later one is
+    ignored.
+
     Attributes:
         arms: Names of the arms.
         delivered: Broadcasts delivered to a peer, over all episodes; one per receiver and sender.
         late: Broadcasts that were lost on the channel, over all episodes.
     """
 
-    def __init__(
-        self, arms: Sequence[str], channel: Channel = PERFECT, *, rng: np.random.Generator | None = None
-    ) -> None:
+    def __init__(self, arms: Sequence[str], channel: Channel = PERFECT) -> None:
         """Prepare an exchange between `arms`.
-
-        Args:
-            rng: For a channel with loss or jitter, until `begin` brings another.
 
         Raises:
             ValueError: no arm, an empty name, a name twice, or the channel names an unknown arm.
@@ -90,13 +88,12 @@ class Exchange:
         self.arms = tuple(arms)
         if not self.arms or not all(self.arms) or len(set(self.arms)) != len(self.arms):
             raise ValueError(f"An exchange needs arms with different, non-empty names (got {self.arms}).")
-        self.delivered = 0
-        self.late = 0
-        self._channel, self._delivery = channel, Delivery(self.arms, channel, rng)
-        self._sent: dict[int, Broadcast] = {}
-        """Last broadcasts received by an arm, and those in transit, by tick."""
-        self._now_s = -float("inf")
+        self.delivered = self.late = 0
+        self._channel, self._linked = channel, channel.links(self.arms)
+        self._cuts = [(p.from_s, p.to_s, p.cuts(self.arms)) for p in channel.partitions]
+        self._rng: np.random.Generator | None = None
         self._closed = False
+        self.begin()
 
     @property
     def perfect(self) -> bool:
@@ -105,9 +102,14 @@ class Exchange:
 
     def begin(self, rng: np.random.Generator | None = None) -> None:
         """Begin an episode without messages received or in transit; `rng` is for channels with loss or jitter."""
-        self._now_s = -float("inf")
-        self._sent.clear()
-        self._delivery.begin(rng)
+        self._rng = rng or self._rng
+        self._now_s, self._tick = -np.inf, -1
+        self._newest = np.full(self._linked.shape, -1)
+        self._sent: dict[int, Broadcast] = {}
+        """Last broadcasts received by an arm, and those in transit, by tick."""
+        self._due_s: dict[int, Array] = {}
+        """When the broadcasts of each tick in transit arrive, [receiver, sender]; inf for one that is lost, or has
+        arrived."""
 
     def share(self, broadcast: Broadcast) -> PeerView:
         """Broadcast one step, and return the view of every arm after it.
@@ -122,10 +124,9 @@ class Exchange:
             sent_s, last_s = f"{broadcast.time_s:g} s", f"{self._now_s:g} s"
             raise ValueError(f"Broadcast of {sent_s} after that of {last_s}; begin() starts a new episode.")
         self._now_s = broadcast.time_s
-        received = self._delivery.carry(self._now_s)
-        self._sent[int(received[0, 0])] = broadcast
-        self.delivered, self.late = self._delivery.delivered, self._delivery.late
-        kept = self._delivery.in_transit | set(np.unique(received).tolist())
+        received = self._carry(self._now_s)
+        self._sent[self._tick] = broadcast
+        kept = self._due_s.keys() | set(np.unique(received).tolist())
         self._sent = {tick: sent for tick, sent in self._sent.items() if tick in kept}
         return _view(broadcast, received, self._sent)
 
@@ -140,56 +141,12 @@ class Exchange:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-
-class Delivery:
-    """Which broadcasts every arm has received through a channel, in one episode after the other.
-
-    A lost broadcast is not sent again: its receiver keeps the last one. A broadcast that arrives after a later one is
-    ignored. The time is that of the broadcasts.
-    """
-
-    def __init__(self, arms: Sequence[str], channel: Channel, rng: np.random.Generator | None = None) -> None:
-        """Prepare a delivery without anything in transit.
-
-        Args:
-            rng: For loss and jitter, until `begin` brings another.
-
-        Raises:
-            ValueError: the channel names an arm that is not there.
-        """
-        self.delivered = 0
-        """Broadcasts delivered to a peer, over all episodes."""
-        self.late = 0
-        """Broadcasts that were lost, over all episodes."""
-        self._channel = channel
-        self._linked = channel.links(arms)
-        self._cuts = [(p.from_s, p.to_s, p.cuts(arms)) for p in channel.partitions]
-        self._rng = rng
-        self.begin(rng)
-
-    def begin(self, rng: np.random.Generator | None = None) -> None:
-        """Begin an episode without broadcasts received or in transit; `rng` is for loss and jitter."""
-        self._rng = rng or self._rng
-        self._tick = -1
-        self._newest = np.full(self._linked.shape, -1)
-        self._due_s: dict[int, Array] = {}
-        """When the broadcasts of each tick in transit arrive, [receiver, sender]; inf for one that is lost, or has
-        arrived."""
-
-    @property
-    def in_transit(self) -> set[int]:
-        """Ticks of broadcasts that have not arrived yet."""
-        return set(self._due_s)
-
-    def carry(self, now_s: float) -> Array:
+    def _carry(self, now_s: float) -> Array:
         """Send the broadcasts of the next tick, and deliver everything that is due by now.
 
         Returns:
             Tick of the last broadcast that each arm has of each arm, [receiver, sender]; −1 for none. An arm has its
             own at once.
-
-        Raises:
-            ValueError: the channel has loss or jitter, and no `rng` was given.
         """
         self._tick += 1
         self._due_s[self._tick] = self._send(now_s)

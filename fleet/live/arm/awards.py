@@ -1,13 +1,12 @@
-"""Arm journal records, and the awards of an arm after a restart.
+"""Awards of an arm: it accepts them, limits the work on them by leases, and reports their end; also after a restart.
 
 An accepted award ends with a report, which is repeated until the auctioneer acknowledges it. Awards that are open when
 the process dies are returned at the next start: the arm is at home again, and only the cycles on disk count. If the arm
 was permitted to commit, the last cycle may have been done or not, and the report says so.
 
-Award executor: accepts awards, limits the work on them by leases, and reports their end.
-
-A state machine without a clock and without I/O: real time is an argument; records go to `keep`, which returns once
-they are on disk. The rules by which no job is done twice are in `fleet.bus.protocol.auction`; those of the arm:
+`AwardExecutor` is a state machine without a clock and without I/O: real time is an argument; records go to `keep`,
+which returns once they are on disk. The rules by which no job is done twice are in `fleet.bus.protocol.auction`; those
+of the arm:
 
 - an award counts only on a quote of this start of the arm that is still valid, once per job of that quote, and the
   answer is on disk before it is sent;

@@ -1,15 +1,4 @@
-"""Interface of the body of an arm: motion, heat and sensors, simulated or replayed.
-
-Body that replays the log of a real arm: it moves and warms as recorded, and accepts no work.
-
-Simulated body of one live arm.
-
-It steps the engine of the simulator, `fleet.engine.step`, in a world of one arm and its current job. A job is done in
-stints: the arm leaves home, does the cycles that it is allowed, and returns home. The allowed cycles can grow during a
-stint, so a job that is allowed to its end is one stint, as in a simulated shift. After a fault the arm stands where it
-stopped. Once it has recovered it ends that cycle and goes home, if no person has moved it home before
-(`ThermalLimits.move_home_s`).
-"""
+"""Body of a live arm, that is its motion, heat and sensors: simulated, or replayed from the log of a real arm."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -191,7 +180,7 @@ class MotionMonitor(Protocol):
 
 
 class ReplayBody:
-    """Body that replays a log once, in fleet time; then it keeps the last sample. See `fleet.live.arm.body.Body`.
+    """Body that replays a log once, in fleet time, and accepts no work; then it keeps the last sample.
 
     Args:
         time_s: Fleet time of the first sample.
@@ -339,7 +328,13 @@ class _Current:
 
 
 class SimulatedBody:
-    """One arm of the simulator in real time, as `fleet.live.arm.body.Body` describes.
+    """One arm of the simulator in real time, as `Body` describes.
+
+    It steps `fleet.engine.step` in a world of one arm and its current job. A job is done in stints: the arm leaves
+    home, does the cycles that it is allowed, and returns home. The allowed cycles can grow during a stint, so a job
+    that is allowed to its end is one stint, as in a simulated shift. After a fault the arm stands where it stopped.
+    Once it has recovered it ends that cycle and goes home, if no person has moved it home before
+    (`ThermalLimits.move_home_s`).
 
     Args:
         arm: True parameters of the arm; its plans and its model are not used.

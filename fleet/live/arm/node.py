@@ -1,18 +1,8 @@
-"""Configuration of an arm of a live fleet.
+"""An arm on the bus: publishes its state, quotes jobs, accepts awards and executes them in fleet time.
 
-What an arm publishes about itself: constants, state, difficulty of jobs, events.
-
-Planning of quotes on a thread of its own, so that no job delays the arm's messages.
-
-Synchronisation of an arm's clock with fleet time.
-
-Source of an arm's work, by default auctioneers.
-
-An arm on the bus: publishes its state, quotes jobs, accepts awards and executes them in fleet time.
-
-One thread runs it, and another one plans (`fleet.live.arm.node`), as a new motion takes 50 ms and more. A reply
-waits for plans for at most `PLANNING_S`, publishes the state meanwhile, and calls the remaining jobs `NOT_PLANNED`; the
-next request finds them planned.
+One thread runs it, and another one plans, as a new motion takes 50 ms and more. A reply waits for plans for at most
+`PLANNING_S`, publishes the state meanwhile, and calls the remaining jobs `NOT_PLANNED`; the next request finds them
+planned.
 """
 
 import logging
@@ -89,29 +79,23 @@ class Publications:
 
     Attributes:
         tick: Number of states so far.
+        state: Publishes a state.
+        info: Publishes the constants of the arm, and holds the last ones.
     """
 
     def __init__(self, link: BusClient, arm: str, boot: int) -> None:
         """Declare the publishers; `link` is open, and `boot` the number of this start of the arm."""
         self._arm, self._boot = arm, boot
         self.tick = self._events = 0
-        self._publish_state = link.publisher(keys.of_arm(link.fleet, arm, "state"), State)
+        self.state = link.publisher(keys.of_arm(link.fleet, arm, "state"), State)
         self._publish_difficulty = link.publisher(keys.of_arm(link.fleet, arm, "difficulty"), DifficultyScores)
         self._publish_event = link.publisher(keys.of_arm(link.fleet, arm, "event"), ArmEvent)
-        self._publish_info = link.publisher(keys.of_arm(link.fleet, arm, "info"), Info)  # holds the last one
-
-    def info(self, joints: int, twin: str) -> None:
-        """Publish the constants of the arm."""
-        self._publish_info(Info(self._arm, joints, twin))
+        self.info = link.publisher(keys.of_arm(link.fleet, arm, "info"), Info)
 
     def next_tick(self) -> int:
         """Return the number of the next state."""
         self.tick += 1
         return self.tick
-
-    def state(self, state: State) -> None:
-        """Publish a state."""
-        self._publish_state(state)
 
     def difficulty(self, estimates: tuple[JobEstimate, ...], twin: str, time_s: float) -> None:
         """Publish how difficult jobs are for the arm, by the plan with the least difficulty, and its bids for them."""
@@ -324,25 +308,13 @@ class WorkSource(Protocol):
         ...
 
 
-class WorkingArm(Protocol):
-    """What a work source needs of its arm."""
-
-    link: BusClient
-    executor: AwardExecutor
-    clock: FleetClock
-
-    def set_clock(self, clock: FleetClock, *, jump: bool = False) -> None:
-        """Use another clock; with `jump` it reads another time now."""
-        ...
-
-
 class AuctioneerClient:
     """Work source: any auctioneer that awards a job. Fleet time is that of the auctioneer."""
 
     objection = ""
     wake_s = math.inf
 
-    def __init__(self, arm: WorkingArm, history: ArmHistory | None = None) -> None:
+    def __init__(self, arm: "ArmNode", history: ArmHistory | None = None) -> None:
         """Start.
 
         Args:
@@ -351,9 +323,7 @@ class AuctioneerClient:
         link, name = arm.link, arm.executor.arm
         self._link, self._executor = link, arm.executor
         self._warn = RateLimitedWarnings(name)
-        self._clock = ClockSync(
-            link, lambda: arm.clock, lambda clock, jump: arm.set_clock(clock, jump=jump), self._warn
-        )
+        self._clock = ClockSync(link, lambda: arm.clock, arm.set_clock, self._warn)
         if history is not None:
 
             def reply(_: HistoryRequest) -> History:
@@ -477,7 +447,7 @@ class ArmNode:
     def _declare(self) -> None:
         link, fleet, name = self.link, self.link.fleet, self._name
         self._publish = Publications(link, name, self._config.boot)
-        self._publish.info(len(self._reading.temp_c), self._estimator.model.version)
+        self._publish.info(Info(name, len(self._reading.temp_c), self._estimator.model.version))
         link.reply_to(keys.of_arm(fleet, name, "quote"), QuoteRequest, self._quote)
         link.reply_to(keys.of_arm(fleet, name, "award"), Award, self._award)
         link.reply_to(keys.of_arm(fleet, name, "reset"), ResetRequest, self._reset)
@@ -784,7 +754,7 @@ class ArmNode:
             "job_p_saturation": None if score is None else score.p_at(known_c, left_s, excess),
         }
 
-    def set_clock(self, clock: FleetClock, *, jump: bool = False) -> None:
+    def set_clock(self, clock: FleetClock, jump: bool = False) -> None:
         """Use another clock; with `jump` it reads another time now, and the body is set to that time."""
         if clock.speed != self.clock.speed:
             self._warn("speed", f"runs at the fleet's speed of {clock.speed:g}, not at {self.clock.speed:g}.")

@@ -83,11 +83,7 @@ class Auctioneer:
     # Messages
 
     def submit(
-        self,
-        submission: Submission,
-        real_s: float,
-        time_s: float,
-        reserved: Mapping[str, JobSpec] = NONE_RESERVED,
+        self, submission: Submission, time_s: float, reserved: Mapping[str, JobSpec] = NONE_RESERVED
     ) -> SubmissionReply:
         """Accept jobs; every accepted one is on disk when this returns.
 

@@ -333,7 +333,7 @@ class AuctionNode(JobDesk):
         self._check_alone("no jobs are accepted")
         if self._epochs.objection:
             raise RefusedForNow(self._epochs.objection)
-        return self.auctioneer.submit(submission, *self._now(), reserved)
+        return self.auctioneer.submit(submission, self.time_s, reserved)
 
     def _clear(self, request: ClearRequest) -> Cleared:
         self._check_alone("no space is cleared")

@@ -1,9 +1,4 @@
-"""One round of an auction: its time limits, the bids of the arms, and which arm gets which job.
-
-Space in an auction: what quotes say about it, and which estimates it closes.
-
-Rounds of an auction: which jobs are offered when, to whom, and what is awarded.
-"""
+"""Rounds of an auction: which jobs are offered when and to whom, what is awarded, and why other jobs wait."""
 
 import dataclasses
 import logging

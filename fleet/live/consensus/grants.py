@@ -1,14 +1,11 @@
-"""Grants of an arm to its peers.
+"""Grants of an arm to its peers, and its own claims; state machines without a clock and without I/O.
 
-A state machine without a clock and without I/O. Real time is an argument. The rules that make it safe are at
-the head of `fleet.live.book`; the quorum is a majority of the roster.
+The rules that make grants safe are at the head of `fleet.live.book`; the quorum is a majority of the roster.
 
-Claims of an arm, and what follows from the replies of a majority.
-
-A state machine without a clock and without I/O. To the arm's `AwardExecutor` it acts as an auctioneer: a job that a
-majority grants is an award, its lease counts from the moment of the query to the last arm of a majority, and an outcome
-that a majority has on disk is receipted. Every claim lists all jobs that the arm has, requests and reports: a peer that
-misses a job there that it has granted knows that the arm has released it.
+To the arm's `AwardExecutor` its `Claimant` acts as an auctioneer: a job that a majority grants is an award, its lease
+counts from the moment of the query to the last arm of a majority, and an outcome that a majority has on disk is
+receipted. Every claim lists all jobs that the arm has, requests and reports: a peer that misses a job there that it has
+granted knows that the arm has released it.
 """
 
 import logging

@@ -55,7 +55,7 @@ BID_S = 1.0
 NO_CHOICE = Choice("")
 MAX_PAUSES = 4096
 """Jobs whose pauses are known, besides those of which one lasts."""
-MAX_OPEN_JOBS = 32
+MAX_BID_JOBS = 32
 """Jobs in one bid."""
 
 Choose = Callable[[Observation, int], int]
@@ -70,7 +70,7 @@ class Membership:
     """Its arms are the roster: a majority is counted in these, present or not."""
     choose: Choose
     """The policy of this arm."""
-    slots: int = MAX_OPEN_JOBS
+    slots: int = MAX_BID_JOBS
     """Jobs that the policy chooses from."""
     places: frozenset[str] | None = None
     """Places of the cell; None allows any name in submitted jobs."""
@@ -113,7 +113,7 @@ class Participant:
         self.rounds = 0
         self._arm, self._fleet, self._policy = arm, membership.fleet, membership.choose
         self._excludes = membership.excludes
-        self._slots, self._rng = min(membership.slots, MAX_OPEN_JOBS), rng
+        self._slots, self._rng = min(membership.slots, MAX_BID_JOBS), rng
         self._number = boot * NUMBERS_PER_BOOT
         self._bids: dict[str, tuple[Bid, float]] = {}
         """Last bid of each arm, and its real second."""
@@ -174,13 +174,13 @@ class Participant:
         elif real_s >= self._behind_s.setdefault(bid.arm, real_s) + 2 * BID_S:
             outcomes = [entry.outcome for entry in book.jobs.values() if entry.outcome is not None]
             operations = book.operations.all
-            for _ in range(MAX_OPEN_JOBS):
+            for _ in range(MAX_BID_JOBS):
                 self._corrected += 1
                 if outcomes:
                     self.claimant.send_outcome(outcomes[self._corrected % len(outcomes)])
                 if operations:
                     self.claimant.send_operation(operations[self._corrected % len(operations)])
-        last = book.jobs.get(bid.open_jobs[-1]) if len(bid.open_jobs) == MAX_OPEN_JOBS else None
+        last = book.jobs.get(bid.open_jobs[-1]) if len(bid.open_jobs) == MAX_BID_JOBS else None
         end = (math.inf, "") if last is None or last.spec is None else job_order(last.spec)
         for job in self.open_jobs():
             if job not in bid.open_jobs and (spec := book.jobs[job].original) is not None and job_order(spec) < end:
@@ -340,7 +340,7 @@ class Participant:
             capacity=capacity,
             estimates=self._arm.estimate(tuple(ready), cycles) if ready else (),
             open_count=len(open_jobs),
-            open_jobs=(*self._missed(), *open_jobs)[:MAX_OPEN_JOBS],
+            open_jobs=(*self._missed(), *open_jobs)[:MAX_BID_JOBS],
             choice=self._choice.job,
             choice_plan=self._choice.plan,
             epoch=book.epoch,

@@ -469,28 +469,6 @@ def test_an_arm_without_a_claim_or_that_does_not_say_where_it_is_may_be_anywhere
     assert granting.claim("b", "p2") == []
 
 
-def test_a_person_frees_the_space_of_an_arm_that_is_not_heard(granting):
-    granting.claim("a", "p1", phase="finishing")
-    for present, at_s, reason in ((set(), 0.0, "lease of 'a' has not ended"), ({"a"}, LATER_S, "present")):
-        with pytest.raises(Refused, match=reason):
-            granting.granter.clear("a", "me", frozenset(present), at_s, 0.0)
-    with pytest.raises(Refused, match=r"no arm of this fleet. Arms: a, b, c."):
-        granting.granter.clear("z", "me", frozenset(), LATER_S, 0.0)
-    granting.granter.clear("a", "me", frozenset(), LATER_S, 0.0)
-    count = len(granting.records)
-    granting.granter.clear("a", "me", frozenset(), LATER_S, 0.0)
-    assert len(granting.records) == count  # the same request again changes nothing
-    granting.start(LATER_S)
-    assert granting.claim("b", "p2", at_s=LATER_S + TIMING.lease_s + 1) == []
-    granting.claim("b", at_s=LATER_S + TIMING.lease_s + 1)
-    for restart in (False, True):  # it is heard again, away from home
-        if restart:
-            granting.start(LATER_S)
-        again = granting.claim("a", "p1", space=("p1",), at_s=2 * LATER_S, phase="finishing")
-        assert again == ["the space of 'a' was cleared"]
-    assert granting.claim("c", "p3", at_s=2 * LATER_S) == ["'a' is in the way"]
-
-
 @pytest.mark.parametrize(
     ("boot", "epoch", "peer", "reason"),
     [

@@ -40,8 +40,10 @@ class MovingFleet:
         jobs: Status of every job by name.
     """
 
-    def __init__(self, endpoint, arms=("arm_0", "arm_1", "arm_2", "arm_3"), fleet="cell", rate_hz=10.0, cycle_s=0.3):
+    def __init__(self, endpoint, arms=("arm_0", "arm_1"), fleet="cell", rate_hz=10.0, cycle_s=0.3, *, auctioneer=""):
+        """Prepare; `auctioneer` is an endpoint of its own for the auctioneer."""
         self.link, self.fleet, self.arms, self.rate_hz = BusClient(endpoint, fleet), fleet, arms, rate_hz
+        self.boss = BusClient(auctioneer, fleet) if auctioneer else self.link
         self.requests, self.jobs, self.paused = [], {}, {}
         self.temp_c = {arm: 35.0 + 6.0 * i for i, arm in enumerate(arms)}
         self.mode = dict.fromkeys(arms, "idle")
@@ -51,32 +53,33 @@ class MovingFleet:
         self.ahead_s = 0.0  # of the clock, since a motor that warms at once has a bad sensor
 
     def __enter__(self):
-        link, fleet = self.link.open(), self.fleet
+        link, boss, fleet = self.link.open(), self.boss.open(), self.fleet
         self.start_s = time.monotonic()
         self.states = {arm: link.publisher(keys.of_arm(fleet, arm, "state"), State) for arm in self.arms}
         self.scores = {
             arm: link.publisher(keys.of_arm(fleet, arm, "difficulty"), DifficultyScores) for arm in self.arms
         }
         self.events = {arm: link.publisher(keys.of_arm(fleet, arm, "event"), bus.ArmEvent) for arm in self.arms}
-        self.results = link.publisher(keys.of_auction(fleet, "auctioneer", "result"), bus.Result)
-        self.operations = link.publisher(keys.of_auction(fleet, "auctioneer", "operation"), Operation)
+        self.results = boss.publisher(keys.of_auction(fleet, "auctioneer", "result"), bus.Result)
+        self.operations = boss.publisher(keys.of_auction(fleet, "auctioneer", "operation"), Operation)
         for arm in self.arms:
             link.declare_token(keys.of_arm(fleet, arm, "alive"))
             link.reply_to(keys.of_arm(fleet, arm, "quote"), bus.QuoteRequest, lambda r, arm=arm: self.quote(arm, r))
             link.reply_to(keys.of_arm(fleet, arm, "reset"), ResetRequest, lambda r, arm=arm: self.reset(arm, r))
-        link.declare_token(keys.of_auction(fleet, "auctioneer", "alive"))
-        link.reply_to(keys.of_jobs(fleet, "submit"), bus.Submission, lambda request: self.submit(request))
-        link.reply_to(keys.of_jobs(fleet, "status"), bus.StatusRequest, self.status)
-        link.reply_to(keys.of_jobs(fleet, "control"), ControlRequest, self.control)
-        link.reply_to(keys.of_jobs(fleet, "clear"), ClearRequest, self.clear)
-        link.reply_to(keys.of_jobs(fleet, "cell"), CellRequest, lambda _: self.cell())
-        link.reply_to(keys.of_clock(fleet), bus.ClockRequest, lambda _: bus.Clock(self.now(), 1.0))
-        self.thread.enter_context(serving(link, meanwhile=self.move))
+        boss.declare_token(keys.of_auction(fleet, "auctioneer", "alive"))
+        boss.reply_to(keys.of_jobs(fleet, "submit"), bus.Submission, lambda request: self.submit(request))
+        boss.reply_to(keys.of_jobs(fleet, "status"), bus.StatusRequest, self.status)
+        boss.reply_to(keys.of_jobs(fleet, "control"), ControlRequest, self.control)
+        boss.reply_to(keys.of_jobs(fleet, "clear"), ClearRequest, self.clear)
+        boss.reply_to(keys.of_jobs(fleet, "cell"), CellRequest, lambda _: self.cell())
+        boss.reply_to(keys.of_clock(fleet), bus.ClockRequest, lambda _: bus.Clock(self.now(), 1.0))
+        self.thread.enter_context(serving(*dict.fromkeys((link, boss)), meanwhile=self.move))
         return self
 
     def __exit__(self, *_):
         self.thread.close()
         self.link.close()
+        self.boss.close()
 
     def now(self):
         return time.monotonic() - self.start_s + self.ahead_s
