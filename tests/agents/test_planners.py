@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
-from agents.planners import NONE, Mpc, RollingHorizon, Sequences, pack
+from agents.planners import NONE, Mpc, RollingHorizon, Sequences, _Memory, pack
 from agents.policy import WAIT, EveryArm, Local, PlanningPolicy
 from agents.registry import RULES, make_policy
 from agents.schedules import Schedules
@@ -128,6 +129,24 @@ def test_the_second_peak_is_that_of_a_network_with_one_time_constant(first_s, se
     after_c = run(start_c, one_c, first_s)
     _, peak_c = policy._earn(one, predicted, np.array([first_s]), np.array([after_c]), start_c, np.array([1]))
     assert peak_c[0] == pytest.approx(max(after_c, run(after_c, two_c, second_s)), abs=1e-3)
+
+
+def test_an_award_costs_the_expected_loss_by_a_fault_discounted_until_its_start() -> None:
+    """At 78 °C, 3 K above the limit, a fault is as likely as none: half of the value 4 and of the price 20."""
+    fleet = {"arm_0": seen([600.0] * 2, [4, 4], [78.0, 40.0]), "arm_1": seen([600.0] * 2, [4, 4], [40.0, 40.0])}
+    loss = Mpc().expected_loss(fleet)
+    assert loss.ravel() == pytest.approx([12.0, 0.0, 0.0, 0.0], abs=1e-3)
+
+    start_s = np.array([[100.0, 1900.0], [1900.0, np.inf], [50.0, 100.0]])  # before the present: not again; inf: never
+
+    class Simulator:
+        def run(self, schedules, discount) -> SimpleNamespace:
+            return SimpleNamespace(reward=np.array([10.0, 10.0, 10.0]), start_s=start_s)
+
+    arm = np.array([[0, 1], [0, 0], [0, 1]])
+    three = Schedules(arm, np.zeros_like(arm), np.array([[1.0, 2.0], [2.0, 1.0], [1.0, np.inf]]), np.zeros(arm.shape))
+    rewards, _ = _Memory(Simulator(), np.ones(9), 100.0, loss, 1800.0).run(three)
+    assert rewards == pytest.approx([-2.0, 10.0 - 12.0 / np.e, 10.0], abs=1e-3)
 
 
 HOT = ThermalLimits(warning_c=40.0, error_c=46.0, restart_c=36.0, clear_s=10.0, move_home_s=30.0)
