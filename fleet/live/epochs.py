@@ -145,12 +145,13 @@ def adopted(book: JobBook, history: History) -> list[BookRecord]:
             continue
         if outcome.arm == book.name:  # it may have done the last cycle, and does not know
             records.append(JobSettled(outcome))
-        elif grant is not None and (grant.record.arm, grant.record.award) == (outcome.arm, outcome.award):
+            continue
+        if grant is not None and (grant.record.arm, grant.record.award) == (outcome.arm, outcome.award):
             records.append(CommitPermitted(outcome.award, book.time_s, outcome.cycles))
         else:
             terms = (outcome.award, outcome.job, outcome.arm, book.time_s, outcome.cycles, (outcome.job,))
             records.append(Granted(*terms, may_commit=True))
-            records.append(ClaimNumbered(outcome.arm, history.claims.get(outcome.arm, 0)))
+        records.append(ClaimNumbered(outcome.arm, history.claims.get(outcome.arm, 0)))
     return records
 
 

@@ -232,6 +232,7 @@ def test_an_older_copy_without_an_auctioneer_learns_of_permission_to_commit(numb
     (status,), grant = book.status(), book.jobs["a"].grant
     assert (status.state, status.arm, status.cycles) == (state, arm, 2)
     assert (grant is not None and grant.may_commit) == (state == "finishing") == bool(book.open)
+    assert book.numbers == ({arm: 5} if state == "finishing" else {})
     assert adopted(book, history) == []
 
 
