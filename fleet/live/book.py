@@ -14,6 +14,8 @@ roster (`fleet.live.consensus.grants`). The rules that make it safe (`fleet.bus.
   or returns the job; no other arm gets the job then.
 - A settled job is granted to no arm, a cancelled one only to the arm that has permission to commit.
 - After a crash every open grant counts as leased from the restart.
+- A grant without permission to commit also ends when an arm has finished the job, or, if an older copy of the journal
+  has it (`fleet.live.epochs`), when an arm has permission to commit under another grant.
 - An arm takes the space of a grant until a later quote or claim of the arm states that it does not. Of two plans that
   exclude each other one is granted. An arm without such a message may be anywhere.
 - A silent grant is revoked when a later quote of its arm states that it takes no space: its job stays unfinished.

@@ -132,21 +132,26 @@ def adopted(book: JobBook, history: History) -> list[BookRecord]:
         permitted = award.award in history.may_commit
         states: tuple[JobState, ...] = ("waiting", "awarded") if permitted else ("waiting",)
         if (grant := book.open.get(award.award)) is not None:
-            if permitted and not grant.may_commit:
+            own = (grant.record.arm, grant.record.job) == (history.arm, award.job.name)
+            if own and permitted and not grant.may_commit:
                 records.append(CommitPermitted(award.award, book.time_s, award.cycles))
         elif book.grant_of(award.award) is None and is_open(award.job, *states):
             records.append(JobsAccepted((award.job,), f"adopted from {history.arm}", book.time_s))
             records.append(_adopted_award(award, history, book.time_s))
     for outcome in history.committed:
         entry = book.jobs.get(outcome.job)
-        if book.is_settled(outcome.job) or (entry is not None and entry.grant is not None):
+        grant = None if entry is None else entry.grant
+        if book.is_settled(outcome.job) or (grant is not None and grant.may_commit):
             continue
         if outcome.arm == book.name:  # it may have done the last cycle, and does not know
             records.append(JobSettled(outcome))
+            continue
+        if grant is not None and (grant.record.arm, grant.record.award) == (outcome.arm, outcome.award):
+            records.append(CommitPermitted(outcome.award, book.time_s, outcome.cycles))
         else:
             terms = (outcome.award, outcome.job, outcome.arm, book.time_s, outcome.cycles, (outcome.job,))
             records.append(Granted(*terms, may_commit=True))
-            records.append(ClaimNumbered(outcome.arm, history.claims.get(outcome.arm, 0)))
+        records.append(ClaimNumbered(outcome.arm, history.claims.get(outcome.arm, 0)))
     return records
 
 

@@ -16,6 +16,7 @@ from fleet.env.validation import check_choice
     [
         *(("sb3", "stable_baselines3", "sb3"), ("rllib", "ray", "rllib"), ("tianshou", "tianshou", "tianshou")),
         *(("benchmarl", "benchmarl", "benchmarl"), ("torchrl", "tensordict", "learn")),
+        ("torchrl", "torch", "learn"),
     ],
 )
 def test_an_adapter_without_its_trainer_names_the_command_that_installs_it(monkeypatch, trainer, library, install):

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.bus.protocol.auction import MOST_JOBS, Award, JobSpec, Quote, Submission
-from fleet.bus.protocol.consensus import History
+from fleet.bus.protocol.consensus import History, JobOutcome
 from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, decode, encode
 from fleet.bus.protocol.operator import Cancel, ClearRequest, ControlRequest
 from fleet.job import reason_to_give_up
@@ -206,6 +206,33 @@ def test_a_permission_to_commit_that_an_older_copy_lacks_is_adopted(number, arm,
         book.replay(adopted(book, history))
         (status,) = book.status()
         assert (status.state, status.arm, len(book.open)) == (state, has, 1)
+    assert adopted(book, history) == []
+
+
+@pytest.mark.parametrize(("arm", "job"), [("arm_0", "a"), ("arm_1", "b")])
+def test_only_the_arm_of_an_award_has_permission_to_commit_its_job(arm, job):
+    book = ledger(spec("a"), spec("b"))
+    book.name = "boss"
+    book.apply(award("a", arm="arm_1"))
+    held = Award("0:a", "r", "boss", "q", spec(job), cycles=2)
+    assert adopted(book, History(arm, "", awards=(held,), may_commit=(held.award,))) == []
+
+
+@pytest.mark.parametrize(
+    ("number", "arm", "state"),
+    [(0, "arm_1", "finishing"), (1, "arm_2", "finishing"), (1, "arm_0", "unfinished")],
+)
+def test_an_older_copy_without_an_auctioneer_learns_of_permission_to_commit(number, arm, state):
+    """That a peer has given, for the grant that the copy has, for a later one, or to the arm of the copy itself."""
+    book = JobBook(name="arm_0", is_central=False).replay([JobsAccepted((spec("a"),), "test", 0.0)])
+    book.apply(award("a", arm="arm_1"))
+    outcome = JobOutcome("a", f"{number}:a", arm, "unfinished", 2, 0.0, "The journals of its arm were lost.")
+    history = History("arm_3", "", claims={arm: 5}, committed=(outcome,))
+    book.replay(adopted(book, history))
+    (status,), grant = book.status(), book.jobs["a"].grant
+    assert (status.state, status.arm, status.cycles) == (state, arm, 2)
+    assert (grant is not None and grant.may_commit) == (state == "finishing") == bool(book.open)
+    assert book.numbers == ({arm: 5} if state == "finishing" else {})
     assert adopted(book, history) == []
 
 

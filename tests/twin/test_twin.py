@@ -100,7 +100,10 @@ def test_a_damaged_checkpoint_is_refused_and_its_damage_named(folder, damage, wo
 def test_a_file_in_place_of_a_folder_and_a_folder_in_place_of_a_file_are_refused(folder):
     with pytest.raises(CheckpointError, match=r"No twin in .*twin\.json: twin\.json is missing"):
         load(folder / CARD)
-    for name, words in ((WEIGHTS, rf"{WEIGHTS} does not fit"), (CARD, r"twin\.json cannot be read: Is a directory")):
+    for name, words in (
+        (WEIGHTS, rf"{WEIGHTS} cannot be read: "),
+        (CARD, r"twin\.json cannot be read: Is a directory"),
+    ):
         (folder / name).unlink()
         (folder / name).mkdir()
         with pytest.raises(CheckpointError, match=words):

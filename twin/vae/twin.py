@@ -326,7 +326,9 @@ def load(folder: Path, *, joints: int = JOINTS) -> Twin:
         raise CheckpointError(f"No twin in {folder}: {WEIGHTS} is missing.") from None
     except KeyError as error:
         raise CheckpointError(f"{folder / WEIGHTS}: missing tensor {error}.") from error
-    except (OSError, SafetensorError, ValueError) as error:
+    except OSError as error:
+        raise CheckpointError(f"{folder / WEIGHTS} cannot be read: {error.strerror or error}.") from error
+    except (SafetensorError, ValueError) as error:
         raise CheckpointError(f"{folder / WEIGHTS} does not fit {CARD}: {' '.join(str(error).split())}") from error
     check_version(folder, card.version, twin.version)
     return twin

@@ -32,8 +32,6 @@ Traps:
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Size
 
 from fleet.env.adapters.arguments import ARM_INFOS, TEAM_INFOS, Infos, check_batch, imported_trainer
 from fleet.env.random_actions import pick_legal
@@ -41,7 +39,9 @@ from fleet.env.validation import seed_of, switch
 from fleet.env.vector import BatchEnv, Obs
 
 with imported_trainer("learn", "constraints.txt"):
+    import torch
     from tensordict import TensorDict, TensorDictBase
+    from torch import Size
     from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
     from torchrl.envs import EnvBase
 
