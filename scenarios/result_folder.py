@@ -77,7 +77,7 @@ def new_folder(out: Path, kind: ResultKind, *, overwrite: bool = False) -> Itera
                 replace_folder(work, target)
     finally:
         if work.exists():
-            shutil.rmtree(work)
+            shutil.rmtree(work, ignore_errors=True)  # another process may remove it, too
             for parent in created:
                 with suppress(OSError):  # another process has put a file there in the meantime
                     parent.rmdir()
@@ -103,13 +103,21 @@ def lock_folder(folder: Path, out: Path | None = None) -> Iterator[None]:
         FleetError: another process has locked it, or it cannot be opened.
     """
     named = out or folder
+    busy = FleetError(f"Another process writes to '{named}'. Wait for it, or choose another --out.")
     with disk_errors(named):
-        handle = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            handle = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+        except FileNotFoundError:
+            if out is None:
+                raise
+            raise busy from None
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise FleetError(f"Another process writes to '{named}'. Wait for it, or choose another --out.") from error
+            raise busy from error
+        if out and not folder.exists():
+            raise busy
         yield
     finally:
         os.close(handle)

@@ -572,6 +572,14 @@ def test_a_row_of_a_table_that_was_never_awarded_has_a_reason(card, finished_s: 
     assert why_late(log) == f"A2 is unfinished 8 min 20 s after its due date: {reason}."
 
 
+def test_a_predecessor_is_no_reason_for_a_job_that_waits_on_for_longer() -> None:
+    """Both were due before A1 was done, but A2 waits from 5 min on, for 11 min 40 s."""
+    first = replace(record("A1", 2000.0, "finished"), finished_s=300.0)
+    jobs, offers = (first, record("A2", 200.0, "waiting")), (offered("A1", 10.0, 100.0),)
+    log = shift(temp_c=30.0, card={"scenario": IN_ORDER}, jobs=jobs, offers=offers)
+    assert why_late(log) == f"A2 is unfinished 13 min 20 s after its due date: {PLACE_TAKEN}."
+
+
 HOLDS = {"name": "hold", "kind": "hold", "places": ["a"], "payload_kg": [0.5, 2.5]}
 
 

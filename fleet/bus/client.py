@@ -31,7 +31,8 @@ from fleet.bus.protocol.operator import check_request
 from fleet.bus.router import Connection
 from fleet.bus.security.access_control import RosterEntry, rights_by_role
 from fleet.bus.security.tls import check_listed, expires_at, is_past, participant_at
-from fleet.errors import BusError, Refused, RefusedForNow
+from fleet.errors import NAME_RULE, ArgumentError, BusError, Refused, RefusedForNow, is_name, printable
+from fleet.fields import check_instance, check_value
 
 _LOG = logging.getLogger(__name__)
 
@@ -42,6 +43,7 @@ Entry = TypeVar("Entry")
 Arguments = TypeVarTuple("Arguments")
 
 BACKLOG = 4096
+MOST_BACKLOG, MOST_TIMEOUT_S = 2**24, 86_400.0
 MOST_REPLIES = 1024
 """Replies to one query that are read: one of each arm of the largest fleet."""
 MOST_REJECTIONS, MOST_CHARACTERS = 1024, 2048
@@ -160,7 +162,12 @@ class BusClient(Connection):
             backlog: Maximum number of queued messages; a full queue drops the oldest.
             stopped: Wait for a router until this is true, instead of `timeout_s`.
         """
-        super().__init__(endpoint, timeout_s, stopped)
+        super().__init__(endpoint, check_value("timeout_s", timeout_s, float, low=0, high=MOST_TIMEOUT_S), stopped)
+        check_instance("endpoint", endpoint, str, "tcp/127.0.0.1:7447")
+        check_value("backlog", backlog, int, low=1, high=MOST_BACKLOG)
+        check_instance("fleet", fleet, str, "quickstart")
+        if not is_name(fleet):
+            raise ArgumentError(f"fleet must have {NAME_RULE} (got '{printable(fleet)}').")
         self.fleet = fleet
         self.malformed = 0
         self.rejections: OrderedDict[str, tuple[str, float]] = OrderedDict()

@@ -68,6 +68,9 @@ class Fleet:
     risk: RiskName = RISK
     """As in `prepare`."""
 
+    def __repr__(self) -> str:
+        return f"<Fleet of {self.scenario.name}: {len(self.arms)} arms, difficulty '{self.difficulty}'>"
+
     @property
     def all(self) -> tuple["Fleet", ...]:
         """The fleet and its variants."""

@@ -108,6 +108,10 @@ class RunLog(ShiftLog):
             _write_telemetry(self.readings, list(self.arms), folder / "telemetry.parquet")
             (folder / "report.html").write_text(self.page(), encoding="utf-8")
 
+    def __repr__(self) -> str:
+        of = f"{self.scenario.name}, {self.card['policy']}, seed {self.card['seed']}"
+        return f"<RunLog of {of}: reward {self.reward:.1f}>"
+
     def _repr_html_(self) -> str:
         from scenarios.show.run_page import run_html
 

@@ -123,11 +123,9 @@ def layout_parts(scenario: Scenario, report: LayoutReport) -> list[Table | str]:
         ),
         numbers=False,
     )
-    reasons = Table(
-        head=("cannot do", "reason"),
-        rows=tuple((f"{entry.arm} at {entry.place}", entry.reason) for entry in report.reach if entry.reason),
-        numbers=False,
-    )
+    cannot = [(f"{entry.arm} at {entry.place}", entry.reason) for entry in report.reach if entry.reason]
+    more = [(f"… and {len(cannot) - MOST_REASONS} more", "all with --json")] if len(cannot) > MOST_REASONS else []
+    reasons = Table(head=("cannot do", "reason"), rows=(*cannot[:MOST_REASONS], *more), numbers=False)
     shared = [pair for pair in report.exclusions if not pair.same_place]
     always = sum(pair.share == 1 for pair in shared)
     pairs = Table(

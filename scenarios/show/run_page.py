@@ -383,7 +383,8 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
         due = f"{duration(abs(wait_s))} {'after' if wait_s >= 0 else 'before'} its release"
         return f"its work takes {duration(took_s)}, and it was due {due}" if own else f"it was due {due}"
     last, ready_s = log.last_before.get(late.job, (log.records[late.job], -math.inf))
-    if ready_s > late.due_s or ready_s - begin_s > (end_s - begin_s) / 2:
+    # One that never began waited for other reasons afterwards, if that was longer.
+    if (own and ready_s > late.due_s) or ready_s - begin_s > (end_s - begin_s) / 2:
         if math.isfinite(ready_s):
             return f"it waited for {last.job}, which finished at {clock(ready_s, log.begin)}"
         return f"it waits for {last.job}, which is not finished ({last.state.replace('_', ' ')})"

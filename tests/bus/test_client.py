@@ -28,7 +28,7 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, Refusal, State, decode, encode, encoding
 from fleet.bus.protocol.operator import ResetReply, ResetRequest
 from fleet.bus.router import Router, other_versions
-from fleet.errors import BusError
+from fleet.errors import ArgumentError, BusError
 from fleet.live.supervisor import Supervisor
 from tests import commands
 from tests.waiting import PATIENCE_S, serve_until, wait_until
@@ -327,6 +327,21 @@ def test_what_nobody_handles_pushes_out_the_oldest(bus):
     listener.serve()
     assert heard == list(range(41, 51))
     assert listener.overrun == 41
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "fleet", "more", "said"),
+    [
+        (None, "f", {}, r"endpoint must be of type str, for example tcp/127\.0\.0\.1:7447 \(got None\)"),
+        ("tcp/127.0.0.1:1", 3, {}, r"fleet must be of type str, for example quickstart \(got 3\)"),
+        ("tcp/127.0.0.1:1", "a/b", {}, r"fleet must have 1 to 128 .* \(got 'a/b'\)"),
+        ("tcp/127.0.0.1:1", "f", {"timeout_s": math.nan}, r"timeout_s must be 0 to 86400 \(got nan\)"),
+        ("tcp/127.0.0.1:1", "f", {"backlog": -3}, r"backlog must be 1 to 16777216 \(got -3\)"),
+    ],
+)
+def test_wrong_arguments_are_refused_before_connecting(endpoint, fleet, more, said) -> None:
+    with pytest.raises(ArgumentError, match=said):
+        BusClient(endpoint, fleet, **more)
 
 
 def test_a_closed_line_says_so(bus):

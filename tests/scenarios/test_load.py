@@ -24,7 +24,7 @@ from fleet.events import Event
 from fleet.job import Fixture
 from scenarios.prepare.fleet import prepare, prepare_arm
 from scenarios.run.shift import run
-from scenarios.show.layout import describe, layout_report
+from scenarios.show.layout import MOST_REASONS, LayoutReport, Reach, describe, layout_parts, layout_report
 from scenarios.show.plan import draw_plan
 from scenarios.show.run_page import figure_table
 from scenarios.spec.jobs import all_works, draw_jobs, rehearsal_works, works_of
@@ -32,6 +32,7 @@ from scenarios.spec.load import library, load
 from scenarios.spec.options import RunSpec
 from scenarios.spec.parse import override, parse_scenario
 from scenarios.spec.schema import Ambient, Scenario
+from scenarios.table import Table
 from tests.scenarios.conftest import SMALL
 
 FILE = Path("heat.toml")
@@ -392,6 +393,30 @@ def test_three_arms_of_every_library_cell_can_work_at_once(name):
     assert report.problems == ()
     assert len(report.at_once) >= 3
     assert report.excluded_share < 0.3
+
+
+def test_a_large_layout_names_the_first_reasons_and_counts_the_others() -> None:
+    scenario = load("quickstart")
+    names = [place.name for place in scenario.places]
+    reach = [
+        Reach(arm=arm.name, place=name, payload_kg=None, lacks_m=0.0, reason="too far")
+        for arm in scenario.arms
+        for name in names
+    ] * 9
+    report = LayoutReport(
+        scenario=scenario.name,
+        clearance_m=0.1,
+        reach=tuple(reach),
+        exclusions=(),
+        excluded_share=0.0,
+        at_once=(),
+        largest=True,
+        problems=(),
+    )
+    _, reasons, *_ = layout_parts(scenario, report)
+    assert isinstance(reasons, Table)
+    assert len(reasons.rows) == MOST_REASONS + 1
+    assert reasons.rows[-1] == (f"… and {len(reach) - MOST_REASONS} more", "all with --json")
 
 
 @pytest.mark.parametrize("name", [cell for cell in CELLS if cell.values != ("scale_64",)])

@@ -19,7 +19,7 @@ from joblib import delayed
 from fleet.errors import FleetError
 from scenarios.processes import Call, LocalWorker, worker_processes
 from scenarios.progress import HINTS, Count, StageClock
-from scenarios.result_folder import check_free, new_folder
+from scenarios.result_folder import check_free, lock_folder, new_folder
 from scenarios.run.log import FILES, RUN
 from scenarios.signals import until_stopped
 from scenarios.table import Table
@@ -339,6 +339,18 @@ def test_of_two_writers_of_a_folder_the_second_is_refused_and_what_a_killed_one_
             pass
         assert set(tmp_path.iterdir()) == {work, kept}
     assert set(tmp_path.iterdir()) == {out, kept}
+
+
+def test_a_draft_that_another_process_has_removed_is_no_error_of_the_system(tmp_path):
+    with (
+        pytest.raises(FleetError, match=r"Another process writes to '.*run'"),
+        lock_folder(tmp_path / "gone", tmp_path / "run"),
+    ):
+        pass
+    with new_folder(tmp_path / "run", RUN) as work:
+        (work / "report.html").write_text("new", encoding="utf-8")
+    with pytest.raises(FleetError, match="other"), new_folder(tmp_path / "other", RUN) as work:
+        work.rmdir()
 
 
 def test_a_run_that_another_process_has_written_meanwhile_is_not_replaced(tmp_path):

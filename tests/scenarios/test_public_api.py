@@ -57,6 +57,7 @@ def test_a_shift_and_a_comparison_from_the_file_of_a_scenario(small_toml, plans,
     again = tf.open_run(tmp_path / "run")
     assert (again.metrics, again.reward, len(again.events)) == (shift.metrics, shift.reward, len(shift.events))
     assert "<" in shift._repr_html_()
+    assert repr(shift) == f"<RunLog of {shift.scenario.name}, round_robin, seed 3: reward {shift.reward:.1f}>"
     seeds: Any = [0, np.int64(1)]
     result = tf.compare(small_toml, ["round_robin", "wspt"], seeds=seeds, difficulty="blind", workers=1)
     assert [type(seed) for seed in result.seeds] == [int, int]
