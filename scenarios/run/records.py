@@ -379,7 +379,7 @@ class ShiftLog:
         stream, record = self.stream(job), self.records.get(job)
         if not stream or record is None:
             return None
-        cycle = (stream.get(name) for name in ("kind", "places", "dwell_s", "force_n"))
+        cycle = (_hashable(stream.get(name)) for name in ("kind", "places", "dwell_s", "force_n"))
         return *cycle, record.payload_kg
 
     @cached_property
@@ -393,17 +393,12 @@ class ShiftLog:
         return {job: frozenset(arms) for job, arms in able.items()}
 
     @cached_property
-    def _arms_by_work(self) -> Sequence[tuple[tuple[Any, ...], set[str]]]:
+    def _arms_by_work(self) -> Mapping[tuple[Any, ...], set[str]]:
         """Of each recorded work the arms that can do a job with it."""
-        able = list[tuple[tuple[Any, ...], set[str]]]()
+        able = dict[tuple[Any, ...], set[str]]()
         for job, arms in self._arms_by_job.items():
-            if (work := self.work(job)) is None:
-                continue
-            known = next((each for other, each in able if other == work), None)
-            if known is None:
-                able.append((work, set(arms)))
-            else:
-                known |= arms
+            if (work := self.work(job)) is not None:
+                able.setdefault(work, set()).update(arms)
         return able
 
     def able_arms(self, job: str) -> list[str] | None:
@@ -413,7 +408,7 @@ class ShiftLog:
         """
         able = self._arms_by_job.get(job)
         if able is None and (work := self.work(job)) is not None:
-            able = next((arms for other, arms in self._arms_by_work if other == work), None)
+            able = self._arms_by_work.get(work)
         return None if able is None else [arm for arm in self.arms if arm in able]
 
     @cached_property
@@ -465,6 +460,11 @@ class ShiftLog:
             rows = slice(*np.searchsorted(time_s, (work.start_s, work.finished_s or work.end_s)))
             load_kg[rows, self.arms.index(work.arm)] = payload_of.get(work.job, 0.0)
         return load_kg
+
+
+def _hashable(value: Any) -> Any:
+    """A value of a scenario's file, with its lists as tuples."""
+    return tuple(map(_hashable, value)) if isinstance(value, list | tuple) else value
 
 
 def job_records(world: World, state: State) -> tuple[JobRecord, ...]:
