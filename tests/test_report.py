@@ -536,10 +536,10 @@ def test_late_jobs_turn_the_badge_red_and_abandoned_ones_come_last() -> None:
     unread = replace(log, readings=Telemetry.empty(2), offers=(offered("open-1", 500.0, 9.0),), events=(
         event(0.0, "release", job="open-1"), event(1000.0, "warning", job="")))  # fmt: skip
     assert lateness_text(unread, late_jobs(unread)[:1]).endswith("what arm_a did meanwhile is not recorded.")
-    told = verdict(log)
-    assert (told.badge, told.good) == ("3 late jobs, 1 job left waiting", False)
+    judged = verdict(log)
+    assert (judged.badge, judged.good) == ("3 late jobs, 1 job left waiting", False)
     assert [late.job for late in late_jobs(log)] == ["open-1", "long-1", "gone-1"]
-    assert told.moments[told.sentences[-1]].time_s == 500.0
+    assert judged.moments[judged.sentences[-1]].time_s == 500.0
     assert lateness_text(log, late_jobs(log)[1:2]) == (
         "long-1 finished 1 min late: its work takes 15 min, and it was due 14 min after its release."
     )
@@ -625,14 +625,14 @@ def test_a_fleet_at_a_standstill_is_told(done_s: float, state: str, able: bool, 
     unable = replace(offers[0], arm="arm_b", feasible=False)
     jobs = (record("done-1", 840.0), record("open-1", 5000.0, state))
     events = done("done-1", 0.0, done_s)
-    told = verdict(shift(*events, card={"status": status}, jobs=jobs, offers=(*offers, unable)))
+    judged = verdict(shift(*events, card={"status": status}, jobs=jobs, offers=(*offers, unable)))
     sentence = (
         "1 job still waited at the end, though arm_a was idle from 0:01:40 to the end: see why jobs are late in the "
         "report, and run another policy."
     )
-    assert (sentence in told.sentences) == stands
-    assert ("1 job left waiting beside idle arms" in told.badge) == stands
-    assert told.good == (status == "finished" and not stands)
+    assert (sentence in judged.sentences) == stands
+    assert ("1 job left waiting beside idle arms" in judged.badge) == stands
+    assert judged.good == (status == "finished" and not stands)
 
 
 def test_a_row_of_a_table_waits_for_the_named_rows_only() -> None:
@@ -650,10 +650,10 @@ def test_an_arm_without_recorded_states_at_the_end_is_not_idle_beside_waiting_jo
 def test_jobs_that_no_record_gives_an_arm_are_no_jobs_beside_idle_arms() -> None:
     jobs = (record("open-1", 5000.0, "waiting"), record("open-2", 5000.0, "waiting"))
     log = shift(card={"status": "finished"}, jobs=jobs)
-    told = verdict(log)
+    judged = verdict(log)
     unknown = "still waited at the end, after at least 15 min; which arms can do"
-    assert (told.badge, told.good) == ("2 jobs left waiting", False)
-    assert f"2 jobs {unknown} them is not recorded." in told.sentences
+    assert (judged.badge, judged.good) == ("2 jobs left waiting", False)
+    assert f"2 jobs {unknown} them is not recorded." in judged.sentences
     partly = verdict(replace(log, offers=(offered("open-1", 50.0, 9.0),)))
     assert (partly.badge, partly.good) == ("1 job left waiting beside idle arms, 1 more left waiting", False)
     (sentence,) = [each for each in partly.sentences if unknown in each]
@@ -668,9 +668,9 @@ def test_a_job_that_was_due_before_its_release_and_never_taken_has_no_time_of_wo
 
 
 @pytest.mark.parametrize(
-    ("kind", "told"), [("break", "had a break at 0:03:20"), ("failure", "failed, not by heat, at 0:03:20")]
+    ("kind", "reason"), [("break", "had a break at 0:03:20"), ("failure", "failed, not by heat, at 0:03:20")]
 )
-def test_a_job_that_came_back_for_a_break_or_a_failure_is_late_by_that(kind: str, told: str) -> None:
+def test_a_job_that_came_back_for_a_break_or_a_failure_is_late_by_that(kind: str, reason: str) -> None:
     events = (
         RELEASE,
         event(100.0, "award", job="long-1"),
@@ -679,7 +679,7 @@ def test_a_job_that_came_back_for_a_break_or_a_failure_is_late_by_that(kind: str
         event(260.0, "home", job="long-1"),
         *LATE,
     )
-    assert why_late(shift(*events, jobs=(record("long-1", 840.0),))) == f"long-1 finished 1 min late: arm_a {told}."
+    assert why_late(shift(*events, jobs=(record("long-1", 840.0),))) == f"long-1 finished 1 min late: arm_a {reason}."
 
 
 def test_a_job_that_is_given_up_with_another_one_says_so() -> None:
@@ -702,9 +702,9 @@ def test_the_event_table_has_jobs_that_were_given_up() -> None:
 def test_a_shift_that_ended_with_its_last_job_says_so() -> None:
     for time_s, count in ((670.0, 1), (7200.0, 0)):
         card = {"status": "finished", "time_s": time_s, "scenario": {"horizon_s": 7200.0}}
-        told = verdict(shift(samples=670, card=card)).sentences
+        sentences = verdict(shift(samples=670, card=card)).sentences
         early = "The shift of 2 h ended after 11 min 10 s, with its last job: all figures are of that time."
-        assert told.count(early) == count
+        assert sentences.count(early) == count
 
 
 @pytest.mark.parametrize(("at_s", "why"), [(250.0, "place or space taken"), (350.0, "break"), (950.0, "paused")])

@@ -146,7 +146,7 @@ def carry(exchange: Exchange, now_s: float, said_s: list[float]) -> np.ndarray:
 
 
 def shift(channel: Channel, ticks: int, seed: int = 0, arms: tuple[str, ...] = THREE) -> tuple[Exchange, np.ndarray]:
-    """An exchange after so many ticks, and the times of the words known after each, [tick, receiver, sender]."""
+    """An exchange after so many ticks, and the times of the messages received after each, [tick, receiver, sender]."""
     exchange = Exchange(arms, channel)
     exchange.begin(np.random.default_rng(seed))
     said_s: list[float] = []

@@ -175,7 +175,7 @@ def test_a_late_report_of_a_finished_job_closes_a_newer_award():
 
 @pytest.mark.parametrize("permitted", [False, True])
 def test_a_job_that_an_arm_finished_without_permission_here_is_one_that_an_older_copy_has_as_awarded(permitted):
-    """Whoever it was awarded to. With permission, the report of the arm may be on its way."""
+    """To any arm. With permission, the report of the arm may be on its way."""
     book = ledger(spec("a"))
     book.apply(award("a", arm="arm_1"))
     if permitted:

@@ -61,12 +61,12 @@ def test_a_run_of_a_fleet_that_stands_still_says_so(thermofleet, small_toml, tmp
     options = ("--difficulty", "blind", "--out", tmp_path / "run")
     said = thermofleet("run", small_toml, "--policy", f"{policy}:Idle", *options).succeeded()
     jobs = run_json(tmp_path / "run")["metrics"]["jobs"]
-    told = re.search(  # without an award no offer is recorded
+    waited = re.search(  # without an award no offer is recorded
         r"(\d+) jobs still waited at the end, after at least 15 min; which arms can do them is not recorded",
         " ".join(said.err.split()),
     )
-    assert told
-    assert 1 < int(told[1]) <= jobs
+    assert waited
+    assert 1 < int(waited[1]) <= jobs
 
 
 @pytest.mark.ci_slow

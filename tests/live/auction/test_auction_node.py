@@ -410,8 +410,8 @@ def test_two_auctioneers_detect_each_other_and_neither_accept_nor_award_jobs(one
     one.world.processes[CLIENT].client.query(STATUS, StatusRequest(), Status, replies.append, timeout_s=2.0)
     one.run(3.0)
     trouble = error.replace("accepted until", "accepted or awarded until")
-    told = [(each.auctioneer, each.trouble, each.jobs[0].reason) for each in replies[0].messages.values()]
-    assert {*told} == {(name, trouble, trouble) for name in (AUCTIONEER, other)}
+    troubles = [(each.auctioneer, each.trouble, each.jobs[0].reason) for each in replies[0].messages.values()]
+    assert {*troubles} == {(name, trouble, trouble) for name in (AUCTIONEER, other)}
     assert not boss(one).book.open
     assert not two.book.open
     one.world.processes["second"].kill("is killed")

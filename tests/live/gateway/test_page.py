@@ -145,9 +145,9 @@ def test_a_fault_is_reset_over_http(gateway, arm):
     assert gateway.ask(*token, {"arm": "a+1", "by": "ann"})[2] == {"arm": "a+1", "changed": True}
     assert arm.requests[-1] == ResetRequest("ann")
     assert gateway.ask(*token, {"arm": "a+1"})[2]["changed"] is False
-    status, _, told = gateway.ask(*token, {"arm": "nobody"})
+    status, _, reply = gateway.ask(*token, {"arm": "nobody"})
     assert status == 404
-    assert told["detail"].startswith("There is no arm 'nobody'. Arms: a+1")
+    assert reply["detail"].startswith("There is no arm 'nobody'. Arms: a+1")
     assert gateway.ask(*token, {"arm": "a/b"})[0] == 422
 
 
@@ -159,9 +159,11 @@ def test_the_snapshot_names_the_paused_arms_and_as_many_jobs_as_asked_for(gatewa
     pause = {"request": "p1", "action": {"action": "pause", "arm": "a+1"}, "by": "ann"}
     assert gateway.ask("POST", "/v4/control", pause)[2]["changed"] is True
     assert arm.requests[-1] == ControlRequest("p1", Pause("a+1"), "ann")
-    told = wait_until(lambda: (snapshot := gateway.ask("GET", "/v4/fleet?jobs=1")[2])["paused"].get("a+1") and snapshot)
-    assert told["paused"] == {"*": "ann", "a+1": "ann"}
-    assert len(told["jobs"]) == 1
+    reply = wait_until(
+        lambda: (snapshot := gateway.ask("GET", "/v4/fleet?jobs=1")[2])["paused"].get("a+1") and snapshot
+    )
+    assert reply["paused"] == {"*": "ann", "a+1": "ann"}
+    assert len(reply["jobs"]) == 1
     gateway.ask("POST", "/v4/control", {"request": "p2", "action": {"action": "resume", "arm": "a+1"}})
 
 
@@ -189,13 +191,13 @@ def test_the_fleet_is_shown_with_ages(gateway, arm):
 
 
 def test_jobs_are_submitted_and_quoted(gateway, arm):
-    status, _, told = gateway.ask("POST", "/v4/jobs", {"jobs": [CRATE_JSON], "by": "me"})
-    assert (status, told["jobs"][0]["accepted"]) == (200, True)
+    status, _, reply = gateway.ask("POST", "/v4/jobs", {"jobs": [CRATE_JSON], "by": "me"})
+    assert (status, reply["jobs"][0]["accepted"]) == (200, True)
     assert arm.requests[-1].jobs[0].name == "crate 1"
-    status, _, told = gateway.ask("GET", "/v4/jobs?job=crate%201")
-    assert (status, told["jobs"][0]["state"]) == (200, "waiting")
-    status, _, told = gateway.ask("POST", "/v4/ask", {"jobs": [CRATE_JSON]})
-    assert (status, told["quotes"][0]["estimates"][0]["plans"][0]["difficulty"]) == (200, 0.2)
+    status, _, reply = gateway.ask("GET", "/v4/jobs?job=crate%201")
+    assert (status, reply["jobs"][0]["state"]) == (200, "waiting")
+    status, _, reply = gateway.ask("POST", "/v4/ask", {"jobs": [CRATE_JSON]})
+    assert (status, reply["quotes"][0]["estimates"][0]["plans"][0]["difficulty"]) == (200, 0.2)
 
 
 def test_all_jobs_of_a_large_fleet_are_told_and_counted():
@@ -206,11 +208,11 @@ def test_all_jobs_of_a_large_fleet_are_told_and_counted():
         desk.reply_on(link)
         with serving(link):
             wait_until(lambda: gateway.ask("GET", "/v4/fleet?jobs=0")[2]["counts"] == counts)
-            status, _, told = gateway.ask("GET", "/v4/jobs")
+            status, _, reply = gateway.ask("GET", "/v4/jobs")
             assert {job["job"] for job in gateway.ask("GET", "/v4/fleet?jobs=5")[2]["jobs"]} >= {"unfinished_0000"}
             wait_until(lambda: [alarm["kind"] for alarm in gateway.ask("GET", "/v4/alarms")[2]] == ["unfinished"])
-    assert (status, told["counts"], told["next"]) == (200, counts, "")
-    assert sorted(job["job"] for job in told["jobs"]) == sorted(desk.entries)
+    assert (status, reply["counts"], reply["next"]) == (200, counts, "")
+    assert sorted(job["job"] for job in reply["jobs"]) == sorted(desk.entries)
 
 
 PROBLEMS = [
@@ -263,10 +265,10 @@ PROBLEMS = [
 @pytest.mark.parametrize("case", PROBLEMS)
 def test_an_error_is_a_problem_document(gateway, case):
     status, request, says, *body_and_headers = case
-    got, kind, told = gateway.ask(*request.split(" ", 1), *body_and_headers)
+    got, kind, reply = gateway.ask(*request.split(" ", 1), *body_and_headers)
     assert (got, kind) == (status, "application/problem+json")
-    assert told["status"] == status
-    assert says in told["detail"]
+    assert reply["status"] == status
+    assert says in reply["detail"]
 
 
 def test_a_path_names_all_its_methods(gateway):
@@ -284,25 +286,25 @@ def test_a_table_is_submitted_in_messages_or_all_its_faults_are_told(gateway, ar
     rows = [f"{i}/Teil;pick_place;conveyor > pallet;0,5;2026-11-23 06:{i % 60:02};{i + 1}/Teil" for i in range(199)]
     table = "\n".join([head, *rows, "199/Teil;hold;pallet;;;"])
     path = "/v4/jobs?shift_begin=2026-11-23T06:00%2B01:00&by=plan"
-    status, _, told = gateway.ask("POST", path, table.encode("cp1252"), CSV)
+    status, _, reply = gateway.ask("POST", path, table.encode("cp1252"), CSV)
     assert status == 200
-    assert all(each["accepted"] for each in told["jobs"])
+    assert all(each["accepted"] for each in reply["jobs"])
     sent = arm.requests[before:]
     assert [len(request.jobs) for request in sent] == [64, 64, 64, 8]
     assert {request.by for request in sent} == {"plan"}
     jobs = [job for request in sent for job in request.jobs]
-    assert [each["job"] for each in told["jobs"]] == [f"{i}/Teil" for i in range(200)]  # as the rows
+    assert [each["job"] for each in reply["jobs"]] == [f"{i}/Teil" for i in range(200)]  # as the rows
     assert [job.name for job in jobs] == [f"{i}/Teil" for i in range(199, -1, -1)]  # each after those it waits for
     assert {job.name: job.release_s for job in jobs if job.name != "199/Teil"} == {
         f"{i}/Teil": 60.0 * (i % 60) for i in range(199)
     }
     wrong = f"{head}\na;hold;moon;;;\nb;hold;mars;;;\n"
-    status, kind, told = gateway.ask("POST", path, wrong, CSV)
+    status, kind, reply = gateway.ask("POST", path, wrong, CSV)
     assert (status, kind, len(arm.requests)) == (422, "application/problem+json", before + 4)
-    assert "The table has 2 errors:\n  row 2, column places: no place 'moon'" in told["detail"]
-    assert "row 3, column places: no place 'mars'" in told["detail"]
-    status, _, told = gateway.ask("POST", path, f"{head}\na;hld;pallet;two;;\n", CSV)
-    assert (status, told["detail"].count("row 2, column ")) == (422, 2)
+    assert "The table has 2 errors:\n  row 2, column places: no place 'moon'" in reply["detail"]
+    assert "row 3, column places: no place 'mars'" in reply["detail"]
+    status, _, reply = gateway.ask("POST", path, f"{head}\na;hld;pallet;two;;\n", CSV)
+    assert (status, reply["detail"].count("row 2, column ")) == (422, 2)
 
 
 def test_jobs_of_a_table_that_are_refused_are_named_by_row_and_what_was_accepted_is_said(gateway, arm, monkeypatch):
@@ -316,15 +318,15 @@ def test_jobs_of_a_table_that_are_refused_are_named_by_row_and_what_was_accepted
     monkeypatch.setattr(arm, "submit", submit)
     rows = [f"j{i},hold,pallet,{'no/one' * (i == 1)}" for i in range(65)]
     text = "\n".join(["name,kind,places,after", *rows])
-    status, _, told = gateway.ask("POST", "/v4/jobs", text[: text.index("j64")], CSV)
-    assert (status, [each["reason"] for each in told["jobs"] if not each["accepted"]]) == (
+    status, _, reply = gateway.ask("POST", "/v4/jobs", text[: text.index("j64")], CSV)
+    assert (status, [each["reason"] for each in reply["jobs"] if not each["accepted"]]) == (
         200,
         ["row 3, column after: It waits for 'no/one'."],
     )
-    status, _, told = gateway.ask("POST", "/v4/jobs", text, CSV)
+    status, _, reply = gateway.ask("POST", "/v4/jobs", text, CSV)
     assert status == 503
     accepted = ", ".join(f"row {number}" for number in (2, *range(4, 67)))
-    assert told["detail"].endswith(f"The journal has no room. Accepted before: {accepted}.")
+    assert reply["detail"].endswith(f"The journal has no room. Accepted before: {accepted}.")
 
 
 def test_a_body_of_unknown_length_is_limited_too(gateway):
@@ -348,10 +350,10 @@ def test_a_slow_body_is_a_timeout(router, monkeypatch):
 
 def test_without_an_auctioneer_the_gateway_says_so():
     with Router() as empty, Served(empty.endpoint) as served:
-        status, _, told = served.ask("POST", "/v4/jobs", {"jobs": [CRATE_JSON]})
-        assert (status, told["detail"]) == (503, "No auctioneer is online in this fleet.")
-        status, _, told = served.ask("GET", "/v4/fleet")
-        assert (status, told["arms"]) == (200, [])
+        status, _, reply = served.ask("POST", "/v4/jobs", {"jobs": [CRATE_JSON]})
+        assert (status, reply["detail"]) == (503, "No auctioneer is online in this fleet.")
+        status, _, reply = served.ask("GET", "/v4/fleet")
+        assert (status, reply["arms"]) == (200, [])
 
 
 def test_a_token_may_do_what_its_role_may(guarded):
@@ -360,18 +362,18 @@ def test_a_token_may_do_what_its_role_may(guarded):
 
     assert ask(WATCHER, "GET", "/")[2]["role"] == "monitor"
     assert ask(WATCHER, "GET", "/v4/jobs")[0] == 200
-    status, _, told = ask(WATCHER, "POST", "/v4/jobs", {"jobs": [CRATE_JSON]})
-    assert (status, told["detail"]) == (403, "This token has the role monitor; this request needs submitter.")
+    status, _, reply = ask(WATCHER, "POST", "/v4/jobs", {"jobs": [CRATE_JSON]})
+    assert (status, reply["detail"]) == (403, "This token has the role monitor; this request needs submitter.")
     assert ask(SENDER, "POST", "/v4/jobs", {"jobs": [CRATE_JSON]})[0] == 200
     for path, body in (("control", PAUSE), ("reset", {"arm": "a+1"})):
-        status, _, told = ask(SENDER, "POST", f"/v4/{path}", body)
-        assert (status, told["detail"]) == (403, "This token has the role submitter; this request needs operator.")
+        status, _, reply = ask(SENDER, "POST", f"/v4/{path}", body)
+        assert (status, reply["detail"]) == (403, "This token has the role submitter; this request needs operator.")
 
 
 def test_the_first_page_lists_all_requests(gateway):
-    status, _, told = gateway.ask("GET", "/")
-    assert (status, told["role"]) == (200, "operator")
-    offered = {(entry["method"], entry["path"]) for entry in told["requests"]}
+    status, _, reply = gateway.ask("GET", "/")
+    assert (status, reply["role"]) == (200, "operator")
+    offered = {(entry["method"], entry["path"]) for entry in reply["requests"]}
     assert {("GET", "/v4/fleet"), ("POST", "/v4/jobs")} <= offered
     for method, path in offered - {("GET", "/v4/events"), ("GET", "/metrics")}:
         assert gateway.ask(method, path, {} if method == "POST" else None)[0] in (200, 422)
@@ -569,8 +571,8 @@ def test_the_monitor_in_javascript_shows_the_fleet(router, arm, tmp_path):
         finally:
             node.kill()
             node.wait(timeout=PATIENCE_S)
-    told = log.read_text(encoding="utf-8")
+    printed = log.read_text(encoding="utf-8")
     assert node.returncode == 0
-    assert re.search(r"a\+1 .*idle.*41\.5.*2 .*18\.5", told)
-    assert "warning" in told
-    assert "crate 1 0.20" in told
+    assert re.search(r"a\+1 .*idle.*41\.5.*2 .*18\.5", printed)
+    assert "warning" in printed
+    assert "crate 1 0.20" in printed
