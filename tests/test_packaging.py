@@ -214,9 +214,13 @@ def test_the_command_works_there(elsewhere):
     assert told["cold"]["t75_min"][1] == pytest.approx(30.0, abs=1.5)
 
 
-@pytest.mark.ci_slow
-def test_an_episode_runs_there_without_any_extra(elsewhere):
+@pytest.mark.parametrize(
+    "compiled", [pytest.param(False, marks=pytest.mark.ci_slow), pytest.param(True, marks=pytest.mark.slow)]
+)
+def test_an_episode_runs_there_without_any_extra(elsewhere, compiled):
     program = f"""{WITHOUT_EXTRAS}
+import os
+os.environ["NUMBA_DISABLE_JIT"] = "{int(not compiled)}"
 from scenarios import make_env
 env = make_env("quickstart", horizon_s=120)  # its twins are in the package
 env.reset(seed=0)
