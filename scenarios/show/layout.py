@@ -14,6 +14,7 @@ from fleet.arm.space import SpaceTable
 from fleet.engine.world import warm_start
 from fleet.files import cache_folder
 from fleet.heat.thermal import WINDING
+from fleet.job import Place, Work
 from fleet.motion import Plan
 from fleet.robot import Robot
 from scenarios.prepare.arms import PlannedArm, air_offsets, plan_arms
@@ -89,7 +90,8 @@ class LayoutReport:
 def layout_report(scenario: Scenario, progress: Progress = quiet) -> LayoutReport:
     """The layout of a scenario's cell. Plans the scenario's work (cached); problems are part of the result."""
     folder = cache_folder()
-    arms = plan_arms(scenario, range(len(scenario.arms)), all_works(scenario), folder, progress)
+    works = all_works(scenario)
+    arms = plan_arms(scenario, range(len(scenario.arms)), works, folder, progress)
     problems = cell_problems(scenario, arms, folder)
     plans = [plan for arm in arms for plan in arm.all_plans]
     space = space_of(scenario, [arm.hardware.robot for arm in arms], plans, folder, progress)
@@ -101,7 +103,7 @@ def layout_report(scenario: Scenario, progress: Progress = quiet) -> LayoutRepor
     return LayoutReport(
         scenario=scenario.name,
         clearance_m=scenario.clearance_m,
-        reach=tuple(_reach(scenario, arm, place.name) for place in scenario.places for arm in arms),
+        reach=tuple(each for place in scenario.places for each in _reach(place, arms, works)),
         exclusions=exclusions,
         excluded_share=float(close.mean()) if close.size else 0.0,
         at_once=at_once,
@@ -149,19 +151,21 @@ def layout_parts(scenario: Scenario, report: LayoutReport) -> list[Table | str]:
     return [matrix, reasons, pairs, sentence]
 
 
-def _reach(scenario: Scenario, arm: PlannedArm, place: str) -> Reach:
-    name = arm.hardware.robot.name
-    able = [work.payload_kg for work in all_works(scenario) if place in work.stations and work in arm.plans]
-    reasons = dict.fromkeys(error.reason for error in arm.infeasible if error.place == place)
-    position_m = next(each.position_m for each in scenario.places if each.name == place)
-    far_m = float(np.linalg.norm(np.subtract(position_m, shoulder_m(arm.hardware.robot))))
-    return Reach(
-        arm=name,
-        place=place,
-        payload_kg=max(able, default=None),
-        lacks_m=max(0.0, far_m - REACH_M),
-        reason="; ".join(reasons),
-    )
+def _reach(place: Place, arms: Sequence[PlannedArm], works: Sequence[Work]) -> Iterator[Reach]:
+    """What each arm can do at a place."""
+    works_there = [work for work in works if place.name in work.stations]
+    for arm in arms:
+        robot = arm.hardware.robot
+        able_kg = [work.payload_kg for work in works_there if work in arm.plans]
+        reasons = dict.fromkeys(error.reason for error in arm.infeasible if error.place == place.name)
+        far_m = float(np.linalg.norm(np.subtract(place.position_m, shoulder_m(robot))))
+        yield Reach(
+            arm=robot.name,
+            place=place.name,
+            payload_kg=max(able_kg, default=None),
+            lacks_m=max(0.0, far_m - REACH_M),
+            reason="; ".join(reasons),
+        )
 
 
 def shoulder_m(robot: Robot) -> Array:

@@ -21,7 +21,7 @@ from fleet.arm.cell import ContactFinder
 from fleet.arrivals import Arrivals
 from fleet.errors import FleetError, ScenarioError
 from fleet.events import Event
-from fleet.job import Fixture
+from fleet.job import Fixture, Work
 from scenarios.prepare.fleet import prepare, prepare_arm
 from scenarios.run.shift import run
 from scenarios.show.layout import MOST_REASONS, LayoutReport, Reach, describe, layout_parts, layout_report
@@ -393,6 +393,24 @@ def test_three_arms_of_every_library_cell_can_work_at_once(name):
     assert report.problems == ()
     assert len(report.at_once) >= 3
     assert report.excluded_share < 0.3
+
+
+def test_a_layout_after_a_run_compares_no_motions_and_makes_the_tasks_once(monkeypatch) -> None:
+    scenario = cell(*APART, places={**BESIDE, "middle": PLACES["middle"]})
+    prepare(scenario, difficulty="blind")
+    made = list[Scenario]()
+
+    def works(scenario: Scenario) -> tuple[Work, ...]:
+        made.append(scenario)
+        return all_works(scenario)
+
+    def compare(*_: object) -> bool:
+        raise AssertionError("compared anew")
+
+    monkeypatch.setattr("scenarios.show.layout.all_works", works)
+    monkeypatch.setattr("fleet.arm.clearance.conflict", compare)
+    assert len(layout_report(scenario).reach) == 2 * 3
+    assert len(made) == 1
 
 
 def test_a_large_layout_names_the_first_reasons_and_counts_the_others() -> None:
