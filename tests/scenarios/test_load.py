@@ -24,7 +24,7 @@ from fleet.events import Event
 from fleet.job import Fixture, Work
 from scenarios.prepare.fleet import prepare, prepare_arm
 from scenarios.run.shift import run
-from scenarios.show.layout import MOST_REASONS, LayoutReport, Reach, describe, layout_parts, layout_report
+from scenarios.show.layout import LayoutReport, Reach, describe, layout_parts, layout_report
 from scenarios.show.plan import draw_plan
 from scenarios.show.run_page import figure_table
 from scenarios.spec.jobs import all_works, draw_jobs, rehearsal_works, works_of
@@ -431,10 +431,28 @@ def test_a_large_layout_names_the_first_reasons_and_counts_the_others() -> None:
         largest=True,
         problems=(),
     )
-    _, reasons, *_ = layout_parts(scenario, report)
+    places, reasons, *_ = layout_parts(scenario, report)
+    assert isinstance(places, Table)
     assert isinstance(reasons, Table)
-    assert len(reasons.rows) == MOST_REASONS + 1
-    assert reasons.rows[-1] == (f"… and {len(reach) - MOST_REASONS} more", "all with --json")
+    assert places.rows == tuple((name, "none") for name in names)
+    assert len(reasons.rows) == 12
+    assert reasons.notes == (f"… and {len(reach) - 12} more; --json has all.",)
+
+
+def test_a_description_has_the_streams_before_the_first_rows_of_a_job_table(tmp_path) -> None:
+    """Of the jobs: one stream and 300 rows of a table, which is named before the stream. And 30 breaks."""
+    lines = ["name,kind,places,payload,repetitions,release,due"]
+    lines += [f"part_{number},hold,bench,0.5,1,0,900" for number in range(300)]
+    (tmp_path / "parts.csv").write_text("\n".join(lines), encoding="utf-8")
+    raw = small()
+    raw["jobs"] = [{"table": "parts.csv"}, {**raw["jobs"][0], "name": "stream"}]
+    raw["breaks"] = [{"name": f"break_{n}", "begin_s": 1.0 * n, "end_s": n + 90.0} for n in range(30)]
+    head, _, jobs, _ = describe(parse_scenario(raw, tmp_path / "heat.toml"))
+    assert isinstance(jobs, Table)
+    assert [name for name, _ in jobs.rows] == ["stream", *(f"part_{number}" for number in range(11))]
+    assert jobs.notes == ("… and 289 more; --json has all.",)
+    assert str(head).count("\nbreak 'break_") == 12
+    assert str(head).endswith("\n… and 18 more; --json has all.")
 
 
 @pytest.mark.parametrize("name", [cell for cell in CELLS if cell.values != ("scale_64",)])
