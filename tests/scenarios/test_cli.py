@@ -503,3 +503,8 @@ def test_a_new_scenario_may_be_a_copy_and_replaces_no_file(thermofleet, tmp_path
         ((tmp_path / "no" / "x.toml",), "No such file or directory."),
     ):
         assert thermofleet("new", *words).refused(reason)
+
+
+def test_a_bound_has_one_end_of_its_search(thermofleet, small_toml: Path) -> None:
+    call = ("bounds", small_toml, "--budget", 30, "--evaluations", 64)
+    assert thermofleet(*call).refused("Error: --budget and --evaluations exclude each other (got 30 and 64).")
