@@ -33,6 +33,7 @@ from scenarios.show.run_page import (
     report_html,
     runs_page,
     standstill,
+    standstill_text,
     verdict,
 )
 from scenarios.show.timeline import shift_charts, stream_of
@@ -626,10 +627,7 @@ def test_a_fleet_at_a_standstill_is_told(done_s: float, state: str, able: bool, 
     jobs = (record("done-1", 840.0), record("open-1", 5000.0, state))
     events = done("done-1", 0.0, done_s)
     judged = verdict(shift(*events, card={"status": status}, jobs=jobs, offers=(*offers, unable)))
-    sentence = (
-        "1 job still waited at the end, though arm_a was idle from 0:01:40 to the end: see why jobs are late in the "
-        "report, and run another policy."
-    )
+    sentence = "1 job still waited at the end, though arm_a was idle from 0:01:40 to the end: run another policy."
     assert (sentence in judged.sentences) == stands
     assert ("1 job left waiting beside idle arms" in judged.badge) == stands
     assert judged.good == (status == "finished" and not stands)
@@ -651,14 +649,30 @@ def test_jobs_that_no_record_gives_an_arm_are_no_jobs_beside_idle_arms() -> None
     jobs = (record("open-1", 5000.0, "waiting"), record("open-2", 5000.0, "waiting"))
     log = shift(card={"status": "finished"}, jobs=jobs)
     judged = verdict(log)
-    unknown = "still waited at the end, after at least 15 min; which arms can do"
     assert (judged.badge, judged.good) == ("2 jobs left waiting", False)
-    assert f"2 jobs {unknown} them is not recorded." in judged.sentences
+    unknown = "waited for at least 15 min; which arms can do"
+    assert f"2 jobs still waited at the end. 2 jobs {unknown} them is not recorded." in judged.sentences
     partly = verdict(replace(log, offers=(offered("open-1", 50.0, 9.0),)))
-    assert (partly.badge, partly.good) == ("1 job left waiting beside idle arms, 1 more left waiting", False)
-    (sentence,) = [each for each in partly.sentences if unknown in each]
-    assert sentence.startswith("1 job still waited at the end, though arm_a was idle from 0:00:00 to the end:")
-    assert sentence.endswith(f"Besides, 1 job {unknown} it is not recorded.")
+    assert (partly.badge, partly.good) == ("2 jobs left waiting, 1 of them beside idle arms", False)
+    assert (
+        "2 jobs still waited at the end, 1 of them though arm_a was idle from 0:00:00 to the end: run another policy. "
+        f"1 job {unknown} it is not recorded."
+    ) in partly.sentences
+
+
+def test_all_jobs_that_waited_at_the_end_are_counted_not_only_those_beside_idle_arms() -> None:
+    """Beside the job at a standstill one waits for a job before it, and five came less than 15 min before the end."""
+    jobs = [record("A1", 5000.0, "waiting"), record("A2", 5000.0, "waiting")]
+    jobs += [replace(record(f"new-{n}", 5000.0, "waiting"), release_s=900.0) for n in range(5)]
+    jobs += [replace(record("future", 5000.0, "waiting"), release_s=2000.0)]
+    offers = tuple(offered(job.job, 950.0, 9.0) for job in jobs)
+    log = shift(card={"status": "finished", "scenario": IN_ORDER}, jobs=tuple(jobs), offers=offers)
+    stood = standstill(log)
+    assert stood is not None
+    assert stood.badge == "7 jobs left waiting, 1 of them beside idle arms"
+    assert standstill_text(log, stood) == (
+        "7 jobs still waited at the end, 1 of them though arm_a was idle from 0:00:00 to the end: run another policy."
+    )
 
 
 def test_a_job_that_was_due_before_its_release_and_never_taken_has_no_time_of_work() -> None:

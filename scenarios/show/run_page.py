@@ -226,6 +226,8 @@ def _occupied(offer: Offer, log: ShiftLog) -> str:
 class Standstill:
     """Jobs that waited at the end of a shift while arms had long been idle."""
 
+    waiting: int
+    """Number of all jobs that waited at the end."""
     jobs: tuple[str, ...]
     """Those that waited for no other job, and that one of the arms can do by the record."""
     arms: tuple[str, ...]
@@ -237,14 +239,12 @@ class Standstill:
     @property
     def badge(self) -> str:
         """What was left, in a few words."""
-        if not self.jobs:
-            return f"{_count_jobs(self.unknown)} left waiting"
-        others = f", {len(self.unknown)} more left waiting" if self.unknown else ""
-        return f"{_count_jobs(self.jobs)} left waiting beside idle arms{others}"
+        some = f", {len(self.jobs)} of them" if len(self.jobs) < self.waiting else ""
+        return f"{_count_jobs(self.waiting)} left waiting{f'{some} beside idle arms' if self.jobs else ''}"
 
 
-def _count_jobs(jobs: Sequence[str]) -> str:
-    return f"{len(jobs)} job{'s' * (len(jobs) > 1)}"
+def _count_jobs(number: int) -> str:
+    return f"{number} job{'s' * (number > 1)}"
 
 
 def standstill(log: ShiftLog) -> Standstill | None:
@@ -259,9 +259,9 @@ def standstill(log: ShiftLog) -> Standstill | None:
     absent = np.all(np.isnan(log.readings.temp_c), axis=-1)
     for a, arm in enumerate(log.arms):
         idle_s[arm] = max(idle_s[arm], float(log.readings.time_s[absent[:, a]].max(initial=0.0)))
-    ready_s = {job.job: log.ready_s(job) for job in log.jobs if job.state == "waiting"}
+    waiting = [job for job in log.jobs if job.state == "waiting" and not job.release_s > end_s]
     jobs, unknown, since_s = set[str](), set[str](), dict[str, float]()
-    for job, job_s in ready_s.items():
+    for job, job_s in ((record.job, log.ready_s(record)) for record in waiting):
         able = log.able_arms(job)
         for arm in log.arms if able is None else able:
             both_s = max(job_s, idle_s[arm])
@@ -274,6 +274,7 @@ def standstill(log: ShiftLog) -> Standstill | None:
     if not jobs and not unknown:
         return None
     return Standstill(
+        waiting=len(waiting),
         jobs=tuple(sorted(jobs)),
         arms=tuple(arm for arm in log.arms if arm in since_s),
         since_s=max(since_s.values(), default=math.nan),
@@ -282,19 +283,21 @@ def standstill(log: ShiftLog) -> Standstill | None:
 
 
 def standstill_text(log: ShiftLog, stood: Standstill) -> str:
-    """How many jobs waited beside which arms since when, and what to look at."""
-    waited = (
-        f"{_count_jobs(stood.unknown)} still waited at the end, after at least {duration(IDLE_S)}; which arms can do "
-        f"{'them' if len(stood.unknown) > 1 else 'it'} is not recorded."
-    )
-    if not stood.jobs:
-        return waited
-    be = "were" if len(stood.arms) > 1 else "was"
-    beside = (
-        f"{_count_jobs(stood.jobs)} still waited at the end, though {names_text(stood.arms)} {be} idle from "
-        f"{clock(stood.since_s, log.begin)} to the end: see why jobs are late in the report, and run another policy."
-    )
-    return f"{beside} Besides, {waited}" if stood.unknown else beside
+    """How many jobs waited, how many of them beside which arms since when, and of how many too little is recorded."""
+    text = f"{_count_jobs(stood.waiting)} still waited at the end"
+    if stood.jobs:
+        some = f"{len(stood.jobs)} of them " if len(stood.jobs) < stood.waiting else ""
+        be = "were" if len(stood.arms) > 1 else "was"
+        text += (
+            f", {some}though {names_text(stood.arms)} {be} idle from {clock(stood.since_s, log.begin)} to the end: "
+            "run another policy"
+        )
+    if stood.unknown:
+        text += (
+            f". {_count_jobs(len(stood.unknown))} waited for at least {duration(IDLE_S)}; which arms can do "
+            f"{'them' if len(stood.unknown) > 1 else 'it'} is not recorded"
+        )
+    return f"{text}."
 
 
 @dataclass(frozen=True, kw_only=True)
