@@ -24,16 +24,13 @@ from fleet.robot import ThermalLimits
 from fleet.telemetry import Telemetry
 from scenarios.run.records import Halt, JobRecord, Offer, ShiftLog
 from scenarios.show.charts import decimate
+from scenarios.show.late_jobs import late_jobs, lateness_text, standstill, standstill_text
 from scenarios.show.run_page import (
     ROWS,
     figure_table,
-    late_jobs,
-    lateness_text,
     other_choices,
     report_html,
     runs_page,
-    standstill,
-    standstill_text,
     verdict,
 )
 from scenarios.show.timeline import shift_charts, stream_of
