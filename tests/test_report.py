@@ -570,6 +570,23 @@ def test_a_row_of_a_table_that_was_never_awarded_has_a_reason(card, finished_s: 
     assert why_late(log) == f"A2 is unfinished 8 min 20 s after its due date: {reason}."
 
 
+@pytest.mark.parametrize(
+    ("policy", "due_s", "rule"),
+    [
+        ("bid_price", 900.0, "; bid_price begins no job that would end 100 min late"),
+        ("limited:wsept", 900.0, "; limited:wsept begins no job that would end 100 min late"),
+        ("bid_price", 2000.0, ""),
+        ("fifo", 900.0, ""),
+        ("bus:wsept", 900.0, ""),
+    ],
+)
+def test_a_policy_that_begins_no_very_late_job_is_named_with_its_rule(policy: str, due_s: float, rule: str) -> None:
+    """The shift ends 2 h after its begin."""
+    card, jobs = {"policy": policy}, (record("open-1", due_s, "waiting"),)
+    log = shift(temp_c=30.0, samples=7200, card=card, jobs=jobs, offers=(offered("open-1", 50.0, 9.0),))
+    assert why_late(log).endswith(f": {PLACE_TAKEN}{rule}.")
+
+
 def test_a_predecessor_is_no_reason_for_a_job_that_waits_on_for_longer() -> None:
     """Both were due before A1 was done, but A2 waits from 5 min on, for 11 min 40 s."""
     first = replace(record("A1", 2000.0, "finished"), finished_s=300.0)

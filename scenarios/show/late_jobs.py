@@ -7,6 +7,7 @@ from statistics import median
 
 import numpy as np
 
+from agents.registry import WORTHLESS_MIN, claims_no_late_jobs
 from fleet.events import Event
 from scenarios.run.records import Halt, JobSpan, Outage, ShiftLog
 from scenarios.show.words import clock, duration, names_text
@@ -193,7 +194,9 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
     if not able:
         return "it was never awarded, and no offer for it or for a job with the same work is recorded"
     halts = {halt_text(log, halt): halt for halt in log.halts if halt.start_s < late.due_s}
-    waits_s = _arm_time(log, able, begin_s, end_s, halts)
+    worthless = not own and end_s - late.due_s >= 60.0 * WORTHLESS_MIN and claims_no_late_jobs(log.policy)
+    rule = f"; {log.policy} begins no job that would end {WORTHLESS_MIN:g} min late" if worthless else ""
+    waits_s = _arm_time(log, able, begin_s, end_s, halts, rule)
     if all(each.start_s >= late.due_s for each in log.plan.breaks):
         waits_s.pop(PAUSED)  # it was late before
     most = max(waits_s, key=lambda why: sum(waits_s[why].values()))
@@ -256,16 +259,21 @@ def _passed(log: ShiftLog, late: LateJob, able: Sequence[str], begin_s: float, e
 
 
 def _arm_time(
-    log: ShiftLog, able: Sequence[str], begin_s: float, end_s: float, halts: Mapping[str, Halt]
+    log: ShiftLog, able: Sequence[str], begin_s: float, end_s: float, halts: Mapping[str, Halt], rule: str
 ) -> dict[str, dict[str, float]]:
     """Time of each arm that can do a job between its release and its award, s, by what the arm did, or by what kept it
-    from getting jobs; "": later jobs."""
+    from getting jobs; "": later jobs.
+
+    Args:
+        rule: Why the policy let the job wait, if it is known; added to what is said of idle arms.
+    """
     slots = int(log.card.get("scenario", {}).get("slots", 0))
     waiting = _most_waiting(log, begin_s, end_s)
     earlier, out, failed = "at work since before its release", "out after a fault", "out after a failure"
     hot, idle = "idle above the warning limit", "idle: the job's place was taken, or the policy let the job wait"
     if 0 < slots < waiting:  # which jobs had the slots is not recorded
         idle = f"{idle}, or it had no slot ({slots} for up to {waiting} waiting jobs)"
+    idle += rule
     absent = "absent, or no state was recorded"
     whys = (*halts, "", earlier, out, failed, PAUSED, hot, idle, absent)
     time_s = {why: dict.fromkeys(able, 0.0) for why in whys}
