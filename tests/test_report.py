@@ -275,6 +275,26 @@ def test_a_long_log_is_cut_from_the_least_serious_end_and_says_by_how_much() -> 
     assert 'class="award"' not in text
 
 
+def test_breaks_of_many_arms_at_once_are_one_event_with_their_number() -> None:
+    arms = tuple(f"arm_{number}" for number in range(30))
+    breaks = [
+        event(time_s + 0.01 * number, kind, arm, job="", reason=reason)
+        for number, arm in enumerate(arms)
+        for time_s, kind, reason in ((600.0, "break", "for 3 min"), (780.0, "break_end", ""), (900.0, "break", ""))
+    ]
+    breaks.append(Event(time_s=600.0, kind="break", arm="arm_31", reason="for 5 min"))
+    text = own(page(events=tuple(breaks), arms=(*arms, "arm_31")))
+    first = "arm_0, arm_1, arm_2, arm_3, arm_4, arm_5 and 24 more"
+    rows = re.findall(r'<tr class="break(?:_end)?"[^>]*>(.*?)</tr>', text)
+    assert [re.findall("<td>(.*?)</td>", row) for row in rows] == [
+        ["0:10:00", "break", first, "", "for 3 min"],
+        ["0:10:00", "break", "arm_31", "", "for 5 min"],
+        ["0:13:00", "break end", first, "", ""],
+        ["0:15:00", "break", first, "", ""],
+    ]
+    assert "3 × break, 1 × break end." in text
+
+
 @given(arrays(np.float64, st.integers(1, 400), elements=st.floats(-50, 150) | st.just(np.nan)), st.integers(5, 60))
 def test_decimation_keeps_both_extremes_the_ends_a_gap_and_the_limit(value: np.ndarray, limit: int) -> None:
     kept = decimate(value, limit)
