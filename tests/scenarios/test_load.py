@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 
 from fleet.arm.cell import ContactFinder
 from fleet.arrivals import Arrivals
@@ -536,6 +537,30 @@ def test_the_hour_that_occurs_twice_has_its_zone():
     )
     told = " ".join(map(str, describe(night)))
     assert "3 at Sun 25 Oct 02:15 CEST, Sun 25 Oct 02:15 CET, Sun 25 Oct 03:15" in told
+
+
+def test_names_in_the_picture_of_a_long_row_cover_no_other_name_and_arms_come_first(tmp_path, monkeypatch) -> None:
+    """30 arms and 60 places in a row of 19 m: all arms have their names, and some of the places."""
+    xs_m = np.linspace(-9.5, 9.5, 30).tolist()
+    arms = [arm(f"arm_{n}", x, 0.0, 90.0) for n, x in enumerate(xs_m)]
+    places = {f"left_{n}": (x - 0.12, 0.45, 0.25) for n, x in enumerate(xs_m)}
+    scenario = cell(*arms, places={**places, **{f"right_{n}": (x + 0.12, 0.45, 0.25) for n, x in enumerate(xs_m)}})
+    reach = tuple(
+        Reach(arm=one.name, place=at.name, payload_kg=1.0, lacks_m=0.0)
+        for one in scenario.arms
+        for at in scenario.places
+    )
+    empty = {"exclusions": (), "at_once": (), "problems": ()}
+    report = LayoutReport(scenario="a", clearance_m=0.0, reach=reach, excluded_share=0.0, largest=True, **empty)
+    figures = list[Figure]()
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
+    draw_plan(tmp_path / "row.png", scenario, report)
+    notes = [text for text in figures[0].axes[0].texts if text.get_text()]
+    boxes = [note.get_window_extent() for note in notes]
+    assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+    names = [note.get_text() for note in notes]
+    assert {each.name for each in scenario.arms} <= {*names}
+    assert 30 < len(names) < 90
 
 
 @pytest.mark.filterwarnings("error")  # matplotlib's, that the names leave no room for the figure
