@@ -417,7 +417,7 @@ def numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
 
 def _event_section(log: ShiftLog) -> Section:
     """The notable events and notices by time, how many there are, and which are left out."""
-    notable = [e for e in _joined_breaks((*log.events, *log.notices)) if e.kind in NOTABLE]
+    notable = [e for e in _joined_breaks(log) if e.kind in NOTABLE]
     if not notable:
         return Section(key="log", title="Events", sentences=("No fault, no warning, no lost claim.",))
     first = sorted(notable, key=lambda e: (NOTABLE.index(e.kind), e.time_s))
@@ -439,16 +439,17 @@ def _event_section(log: ShiftLog) -> Section:
     return Section(key="log", title="Events", sentences=tuple(sentences), html=shown)
 
 
-def _joined_breaks(events: Iterable[Event | Notice]) -> Iterator[Event | Notice]:
-    """Yield the events; those of arms whose breaks begin, or end, in the same second as one."""
+def _joined_breaks(log: ShiftLog) -> Iterator[Event | Notice]:
+    """Yield events and notices; the events of arms whose breaks begin, or end, in the same second as one."""
     breaks = dict[tuple[str, int, str], list[Event | Notice]]()
-    for event in events:
+    for event in (*log.events, *log.notices):
         if event.kind in ("break", "break_end"):
             breaks.setdefault((event.kind, round(event.time_s), event.reason), []).append(event)
         else:
             yield event
     for alike in breaks.values():
-        yield replace(alike[0], arm=names_text([each.arm for each in alike]))
+        arms = {each.arm for each in alike}
+        yield replace(alike[0], arm=names_text([arm for arm in log.arms if arm in arms]))
 
 
 def _before(event: Event | Notice) -> Moment:
