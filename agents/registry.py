@@ -90,6 +90,9 @@ RULES: dict[str, BuiltInPolicy] = {
     "quickest_matching": BuiltInPolicy("rules:QuickestMatching", _TIME, _KUHN),
 }
 """The policies, simple ones first."""
+BY_WORTH = frozenset({"wsept", "wsept_ahead", "wsept_local", "bid_price", "bid_price_shared", "auction"})
+"""Policies that claim no job that would end `WORTHLESS_MIN` late: its worth falls by 1 % of its value per minute."""
+WORTHLESS_MIN = 100.0
 
 
 @dataclass(frozen=True)
@@ -131,6 +134,12 @@ def rule_of(name: str) -> BuiltInPolicy:
     if name not in RULES:
         raise ValueError(f"No policy '{name}'{nearest(name, RULES)}")
     return RULES[name]
+
+
+def claims_no_late_jobs(name: str) -> bool:
+    """Whether a policy, wrapped or not, claims no job that would end `WORTHLESS_MIN` late; False if unknown."""
+    *wrappers, inner = name.split(":")
+    return inner in BY_WORTH and WRAPPERS.keys() >= {*wrappers}
 
 
 def make_policy(name: str) -> "Policy":

@@ -24,15 +24,13 @@ from fleet.robot import ThermalLimits
 from fleet.telemetry import Telemetry
 from scenarios.run.records import Halt, JobRecord, Offer, ShiftLog
 from scenarios.show.charts import decimate
+from scenarios.show.late_jobs import late_jobs, lateness_text, standstill, standstill_text
 from scenarios.show.run_page import (
     ROWS,
     figure_table,
-    late_jobs,
-    lateness_text,
     other_choices,
     report_html,
     runs_page,
-    standstill,
     verdict,
 )
 from scenarios.show.timeline import shift_charts, stream_of
@@ -275,6 +273,26 @@ def test_a_long_log_is_cut_from_the_least_serious_end_and_says_by_how_much() -> 
     assert (text.count('<tr class="fault"'), text.count('<tr class="warning"')) == (1, 2)
     assert f"{ROWS} of 1006 are listed; left out: {1006 - ROWS} × claim lost" in text
     assert 'class="award"' not in text
+
+
+def test_breaks_of_many_arms_at_once_are_one_event_with_their_number() -> None:
+    arms = tuple(f"arm_{number}" for number in range(30))
+    breaks = [
+        event(time_s, kind, arm, job="", reason=reason)
+        for arm in arms
+        for time_s, kind, reason in ((600.0, "break", "for 3 min"), (780.0, "break_end", ""), (900.0, "break", ""))
+    ]
+    breaks.append(Event(time_s=600.0, kind="break", arm="arm_31", reason="for 5 min"))
+    text = own(page(events=tuple(breaks), arms=(*arms, "arm_31")))
+    first = "arm_0, arm_1, arm_2, arm_3, arm_4, arm_5 and 24 more"
+    rows = re.findall(r'<tr class="break(?:_end)?"[^>]*>(.*?)</tr>', text)
+    assert [re.findall("<td>(.*?)</td>", row) for row in rows] == [
+        ["0:10:00", "break", first, "", "for 3 min"],
+        ["0:10:00", "break", "arm_31", "", "for 5 min"],
+        ["0:13:00", "break end", first, "", ""],
+        ["0:15:00", "break", first, "", ""],
+    ]
+    assert "3 × break, 1 × break end." in text
 
 
 @given(arrays(np.float64, st.integers(1, 400), elements=st.floats(-50, 150) | st.just(np.nan)), st.integers(5, 60))
@@ -572,6 +590,23 @@ def test_a_row_of_a_table_that_was_never_awarded_has_a_reason(card, finished_s: 
     assert why_late(log) == f"A2 is unfinished 8 min 20 s after its due date: {reason}."
 
 
+@pytest.mark.parametrize(
+    ("policy", "due_s", "rule"),
+    [
+        ("bid_price", 900.0, "; bid_price begins no job that would end 100 min late"),
+        ("limited:wsept", 900.0, "; limited:wsept begins no job that would end 100 min late"),
+        ("bid_price", 2000.0, ""),
+        ("fifo", 900.0, ""),
+        ("bus:wsept", 900.0, ""),
+    ],
+)
+def test_a_policy_that_begins_no_very_late_job_is_named_with_its_rule(policy: str, due_s: float, rule: str) -> None:
+    """The shift ends 2 h after its begin."""
+    card, jobs = {"policy": policy}, (record("open-1", due_s, "waiting"),)
+    log = shift(temp_c=30.0, samples=7200, card=card, jobs=jobs, offers=(offered("open-1", 50.0, 9.0),))
+    assert why_late(log).endswith(f": {PLACE_TAKEN}{rule}.")
+
+
 def test_a_predecessor_is_no_reason_for_a_job_that_waits_on_for_longer() -> None:
     """Both were due before A1 was done, but A2 waits from 5 min on, for 11 min 40 s."""
     first = replace(record("A1", 2000.0, "finished"), finished_s=300.0)
@@ -626,10 +661,7 @@ def test_a_fleet_at_a_standstill_is_told(done_s: float, state: str, able: bool, 
     jobs = (record("done-1", 840.0), record("open-1", 5000.0, state))
     events = done("done-1", 0.0, done_s)
     judged = verdict(shift(*events, card={"status": status}, jobs=jobs, offers=(*offers, unable)))
-    sentence = (
-        "1 job still waited at the end, though arm_a was idle from 0:01:40 to the end: see why jobs are late in the "
-        "report, and run another policy."
-    )
+    sentence = "1 job still waited at the end, though arm_a was idle from 0:01:40 to the end: run another policy."
     assert (sentence in judged.sentences) == stands
     assert ("1 job left waiting beside idle arms" in judged.badge) == stands
     assert judged.good == (status == "finished" and not stands)
@@ -651,14 +683,30 @@ def test_jobs_that_no_record_gives_an_arm_are_no_jobs_beside_idle_arms() -> None
     jobs = (record("open-1", 5000.0, "waiting"), record("open-2", 5000.0, "waiting"))
     log = shift(card={"status": "finished"}, jobs=jobs)
     judged = verdict(log)
-    unknown = "still waited at the end, after at least 15 min; which arms can do"
     assert (judged.badge, judged.good) == ("2 jobs left waiting", False)
-    assert f"2 jobs {unknown} them is not recorded." in judged.sentences
+    unknown = "waited for at least 15 min; which arms can do"
+    assert f"2 jobs still waited at the end. 2 jobs {unknown} them is not recorded." in judged.sentences
     partly = verdict(replace(log, offers=(offered("open-1", 50.0, 9.0),)))
-    assert (partly.badge, partly.good) == ("1 job left waiting beside idle arms, 1 more left waiting", False)
-    (sentence,) = [each for each in partly.sentences if unknown in each]
-    assert sentence.startswith("1 job still waited at the end, though arm_a was idle from 0:00:00 to the end:")
-    assert sentence.endswith(f"Besides, 1 job {unknown} it is not recorded.")
+    assert (partly.badge, partly.good) == ("2 jobs left waiting, 1 of them beside idle arms", False)
+    assert (
+        "2 jobs still waited at the end, 1 of them though arm_a was idle from 0:00:00 to the end: run another policy. "
+        f"1 job {unknown} it is not recorded."
+    ) in partly.sentences
+
+
+def test_all_jobs_that_waited_at_the_end_are_counted_not_only_those_beside_idle_arms() -> None:
+    """Beside the job at a standstill one waits for a job before it, and five came less than 15 min before the end."""
+    jobs = [record("A1", 5000.0, "waiting"), record("A2", 5000.0, "waiting")]
+    jobs += [replace(record(f"new-{n}", 5000.0, "waiting"), release_s=900.0) for n in range(5)]
+    jobs += [replace(record("future", 5000.0, "waiting"), release_s=2000.0)]
+    offers = tuple(offered(job.job, 950.0, 9.0) for job in jobs)
+    log = shift(card={"status": "finished", "scenario": IN_ORDER}, jobs=tuple(jobs), offers=offers)
+    stood = standstill(log)
+    assert stood is not None
+    assert stood.badge == "7 jobs left waiting, 1 of them beside idle arms"
+    assert standstill_text(log, stood) == (
+        "7 jobs still waited at the end, 1 of them though arm_a was idle from 0:00:00 to the end: run another policy."
+    )
 
 
 def test_a_job_that_was_due_before_its_release_and_never_taken_has_no_time_of_work() -> None:

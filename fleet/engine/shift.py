@@ -248,15 +248,19 @@ def _described(
         case event_numbers.EXPIRE:
             return "expire", math.nan, "its due date passed while it waited"
         case event_numbers.FAILURE:
-            return "failure", value, f"not by heat; repaired after {value:.0f} s"
+            return "failure", value, f"not by heat; repaired after {_minutes(value)}"
         case event_numbers.BREAK:
-            return "break", value, f"for {value:.0f} s"
+            return "break", value, f"for {_minutes(value)}"
         case event_numbers.BREAK_END:
             return "break_end", math.nan, ""
         case _ if math.isnan(value):
             return "recover", math.nan, "repaired"
         case _:
             return "recover", math.nan, f"every motor below {tables.restart_c:g} °C and the fault cleared"
+
+
+def _minutes(time_s: float) -> str:
+    return f"{round(time_s / 60, 1):g} min"
 
 
 def _releases(world: World, state: State) -> Iterator[Event]:

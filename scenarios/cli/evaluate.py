@@ -326,6 +326,11 @@ def bounds_command(
             raise FleetError(f"Give either scenarios or --suite (got {'both' if suite else 'neither'}).")
         tasks = bounds.tasks_of(suite or scenarios or "", seeds, first_seed)
         if "evaluations" in budget:
+            if "seconds" in budget:
+                raise FleetError(
+                    f"--budget and --evaluations exclude each other (got {budget['seconds']:g} and "
+                    f"{budget['evaluations']}). Leave one out."
+                )
             budget["seconds"] = inf
         policies = options.split_names(starts) if starts else bounds.STARTS
         for name in policies:

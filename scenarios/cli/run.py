@@ -58,7 +58,8 @@ def run_command(
     from scenarios.policy_loader import blaming, label, policy_of
     from scenarios.result_folder import check_free
     from scenarios.run.log import RUN
-    from scenarios.show.run_page import figure_table, standstill, standstill_text
+    from scenarios.show.late_jobs import standstill, standstill_text
+    from scenarios.show.run_page import figure_table
     from scenarios.spec.jobs import check_some_jobs
     from scenarios.spec.load import load, own_seed
 

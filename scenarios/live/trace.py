@@ -15,7 +15,7 @@ from scenarios.live.recording import CARD, read_parts
 from scenarios.live.recording_report import open_recording
 from scenarios.run.log import open_run
 from scenarios.run.records import Offer, ShiftLog
-from scenarios.show.run_page import late_jobs, lateness_text
+from scenarios.show.late_jobs import late_jobs, lateness_text
 from scenarios.show.words import clock, offer_text, value_text
 from scenarios.table import Table
 

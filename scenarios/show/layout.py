@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass
 from itertools import combinations
+from typing import TypeVar
 
 import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
@@ -14,6 +15,7 @@ from fleet.arm.space import SpaceTable
 from fleet.engine.world import warm_start
 from fleet.files import cache_folder
 from fleet.heat.thermal import WINDING
+from fleet.job import Place, Work
 from fleet.motion import Plan
 from fleet.robot import Robot
 from scenarios.prepare.arms import PlannedArm, air_offsets, plan_arms
@@ -27,10 +29,11 @@ from scenarios.spec.schema import ArmSpec, JobStream, Scenario
 from scenarios.table import Table
 
 Array = np.ndarray
+T = TypeVar("T")
 SEARCH_S = 20.0
 """Time limit of the search for the most arms at work at once."""
-WORST = 8
-"""Pairs of jobs in the table of exclusions."""
+MOST_ROWS = 12
+"""Rows that a table shows, and sentences of one kind."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +92,8 @@ class LayoutReport:
 def layout_report(scenario: Scenario, progress: Progress = quiet) -> LayoutReport:
     """The layout of a scenario's cell. Plans the scenario's work (cached); problems are part of the result."""
     folder = cache_folder()
-    arms = plan_arms(scenario, range(len(scenario.arms)), all_works(scenario), folder, progress)
+    works = all_works(scenario)
+    arms = plan_arms(scenario, range(len(scenario.arms)), works, folder, progress)
     problems = cell_problems(scenario, arms, folder)
     plans = [plan for arm in arms for plan in arm.all_plans]
     space = space_of(scenario, [arm.hardware.robot for arm in arms], plans, folder, progress)
@@ -101,7 +105,7 @@ def layout_report(scenario: Scenario, progress: Progress = quiet) -> LayoutRepor
     return LayoutReport(
         scenario=scenario.name,
         clearance_m=scenario.clearance_m,
-        reach=tuple(_reach(scenario, arm, place.name) for place in scenario.places for arm in arms),
+        reach=tuple(each for place in scenario.places for each in _reach(place, arms, works)),
         exclusions=exclusions,
         excluded_share=float(close.mean()) if close.size else 0.0,
         at_once=at_once,
@@ -111,57 +115,71 @@ def layout_report(scenario: Scenario, progress: Progress = quiet) -> LayoutRepor
 
 
 def layout_parts(scenario: Scenario, report: LayoutReport) -> list[Table | str]:
-    """Reach matrix, reasons and exclusions; and the most arms at work at once, in a sentence."""
-    arms = [arm.name for arm in scenario.arms]
-    reach = {(entry.place, entry.arm): entry for entry in report.reach}
-    matrix = Table(
-        caption=f"{scenario.name}: heaviest payload (kg) of the jobs that an arm can do at a place; –: it can do none",
-        head=("place", *arms),
-        rows=tuple(
-            (place.name, *("–" if (kg := reach[place.name, arm].payload_kg) is None else f"{kg:g}" for arm in arms))
-            for place in scenario.places
-        ),
-        numbers=False,
+    """Reach, reasons and exclusions; and the most arms at work at once, in a sentence."""
+    able = {place.name: list[str]() for place in scenario.places}
+    for entry in report.reach:
+        if entry.payload_kg is not None:
+            able[entry.place].append(f"{entry.arm} {entry.payload_kg:g} kg")
+    places, notes = _first(
+        [(place, names_text(able[place]) or "none") for place in sorted(able, key=lambda place: bool(able[place]))]
     )
-    cannot = [(f"{entry.arm} at {entry.place}", entry.reason) for entry in report.reach if entry.reason]
-    more = [(f"… and {len(cannot) - MOST_REASONS} more", "all with --json")] if len(cannot) > MOST_REASONS else []
-    reasons = Table(head=("cannot do", "reason"), rows=(*cannot[:MOST_REASONS], *more), numbers=False)
+    reach = Table(
+        caption=f"{scenario.name}: arms that can do jobs at a place, each with the heaviest payload of these jobs",
+        head=("place", "arms"),
+        rows=places,
+        numbers=False,
+        notes=notes,
+    )
+    near = sorted(report.reach, key=lambda entry: entry.lacks_m)
+    cannot, notes = _first([(f"{entry.arm} at {entry.place}", entry.reason) for entry in near if entry.reason])
+    reasons = Table(head=("cannot do", "reason"), rows=cannot, numbers=False, notes=notes)
     shared = [pair for pair in report.exclusions if not pair.same_place]
     always = sum(pair.share == 1 for pair in shared)
+    rows, notes = _first(
+        [
+            (*(f"{job}, {arm}" for job, arm in zip(pair.jobs, pair.arms, strict=True)), f"{pair.share:.0%}")
+            for pair in shared
+        ]
+    )
     pairs = Table(
         caption=f"{report.excluded_share:.0%} of the pairs of plans of two arms come closer than "
         f"{report.clearance_m * 1e3:g} mm and exclude each other. Pairs of jobs at different "
-        f"stations: {always} exclude each other always, {len(shared) - always} for some plans"
-        + (f". The first {WORST}:" if len(shared) > WORST else ":" if shared else "."),
+        f"stations: {always} exclude each other always, {len(shared) - always} for some plans{':' if shared else '.'}",
         head=("job", "excludes", "share of plans") if shared else ("", "", ""),
-        rows=tuple(
-            (*(f"{job}, {arm}" for job, arm in zip(pair.jobs, pair.arms, strict=True)), f"{pair.share:.0%}")
-            for pair in shared[:WORST]
-        ),
+        rows=rows,
         numbers=False,
+        notes=notes,
     )
-    most = ", ".join(f"{work.arm} {work.job}" for work in report.at_once)
+    most = names_text([f"{task.arm} {task.job}" for task in report.at_once])
     sentence = (
-        f"{'At most' if report.largest else 'At least'} {len(report.at_once)} of {len(arms)} arms can work at once"
-        + (f", for example {most}." if most else ".")
+        f"{'At most' if report.largest else 'At least'} {len(report.at_once)} of {len(scenario.arms)} arms can work "
+        f"at once{most and f', for example {most}'}."
         + ("" if report.largest else f" The search for more ended after {SEARCH_S:g} s.")
     )
-    return [matrix, reasons, pairs, sentence]
+    return [reach, reasons, pairs, sentence]
 
 
-def _reach(scenario: Scenario, arm: PlannedArm, place: str) -> Reach:
-    name = arm.hardware.robot.name
-    able = [work.payload_kg for work in all_works(scenario) if place in work.stations and work in arm.plans]
-    reasons = dict.fromkeys(error.reason for error in arm.infeasible if error.place == place)
-    position_m = next(each.position_m for each in scenario.places if each.name == place)
-    far_m = float(np.linalg.norm(np.subtract(position_m, shoulder_m(arm.hardware.robot))))
-    return Reach(
-        arm=name,
-        place=place,
-        payload_kg=max(able, default=None),
-        lacks_m=max(0.0, far_m - REACH_M),
-        reason="; ".join(reasons),
-    )
+def _first(rows: Sequence[T], complete: str = "--json") -> tuple[tuple[T, ...], tuple[str, ...]]:
+    """The first rows, and a sentence with the number of the others, if any, and with the option that prints all."""
+    others = len(rows) - MOST_ROWS
+    return tuple(rows[:MOST_ROWS]), (f"… and {others} more; {complete} has all.",) if others > 0 else ()
+
+
+def _reach(place: Place, arms: Sequence[PlannedArm], works: Sequence[Work]) -> Iterator[Reach]:
+    """What each arm can do at a place."""
+    works_there = [work for work in works if place.name in work.stations]
+    for arm in arms:
+        robot = arm.hardware.robot
+        able_kg = [work.payload_kg for work in works_there if work in arm.plans]
+        reasons = dict.fromkeys(error.reason for error in arm.infeasible if error.place == place.name)
+        far_m = float(np.linalg.norm(np.subtract(place.position_m, shoulder_m(robot))))
+        yield Reach(
+            arm=robot.name,
+            place=place.name,
+            payload_kg=max(able_kg, default=None),
+            lacks_m=max(0.0, far_m - REACH_M),
+            reason="; ".join(reasons),
+        )
 
 
 def shoulder_m(robot: Robot) -> Array:
@@ -230,12 +248,8 @@ REGIMES = {
     "nothing decides": "Nothing decides: the arms have time, and every choice heats the motors alike or too little",
 }
 """Sentences of the regimes of `LoadFactor`."""
-MOST_REASONS = 20
-"""Reasons that are shown why an arm cannot do a job."""
 MOST_TIMES = 4
 """Times of a trace in a description."""
-MOST_STREAMS = 64
-"""Streams of jobs, or rows of a table, in a description."""
 
 
 def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | str]:
@@ -259,10 +273,7 @@ def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | str
         f"{able}\n"
         f"{_fault_cost(scenario)}\n"
         f"people touch an arm for up to {people.contact_s:g} s: a surface of {people.burn_c:g} °C or more burns"
-        f"{_absences(scenario)}"
     )
-    refused = list(dict.fromkeys(map(str, fleet.infeasible)))
-    more = [f"… and {len(refused) - MOST_REASONS} more."] if len(refused) > MOST_REASONS else []
     nobody = [
         f"No arm can do '{stream.name}' at {' → '.join(names)}; its other places serve."
         for stream in scenario.jobs
@@ -273,8 +284,11 @@ def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | str
         )
         if not any(work in arm.plans for work in works for arm in fleet.arms)
     ]
-    tail = [*nobody, *refused[:MOST_REASONS], *more] or ["Every arm can do every job."]
-    return [head, _arms(scenario), _jobs(scenario), "\n".join([*tail, *_limits_passed_idle(fleet)])]
+    refused, notes = _first([*nobody, *dict.fromkeys(map(str, fleet.infeasible))], "thermofleet layout --json")
+    tail = [*refused, *notes, *_limits_passed_idle(fleet)]
+    if not refused:
+        tail.insert(0, "Every arm can do every job.")
+    return ["\n".join([head, *_absences(scenario)]), _arms(scenario), _jobs(scenario), "\n".join(tail)]
 
 
 def _limits_passed_idle(fleet: Fleet) -> Iterator[str]:
@@ -316,27 +330,25 @@ def _arms(scenario: Scenario) -> Table:
         ("wear", lambda a: f"{a.wear:g}"),
     ]
     shown = [(name, text) for name, text in columns if any(text(a) != text(usual) for a in scenario.arms)]
-    rows = tuple(
-        (
-            a.name,
-            ", ".join(f"{v:g}" for v in a.position_m),
-            ", ".join(f"{v:g}" for v in a.tilt_deg),
-            *(text(a) for _, text in shown),
-        )
-        for a in scenario.arms
+    rows, notes = _first(
+        [
+            (
+                a.name,
+                ", ".join(f"{v:g}" for v in a.position_m),
+                ", ".join(f"{v:g}" for v in a.tilt_deg),
+                *(text(a) for _, text in shown),
+            )
+            for a in scenario.arms
+        ]
     )
     head = ("arms", "position, m", "tilt, deg", *(name for name, _ in shown))
-    return Table(head=head, rows=rows, numbers=False)
+    return Table(head=head, rows=rows, numbers=False, notes=notes)
 
 
 def _jobs(scenario: Scenario) -> Table:
-    """One row per stream, as sentences that fit any terminal."""
-    rows = tuple(
-        (s.name, f"{_work(s)}\nworth {s.value:g}, {_due(s)}; {_arrivals(scenario, s)}")
-        for s in scenario.jobs[:MOST_STREAMS]
-    )
-    more = len(scenario.jobs) - MOST_STREAMS
-    notes = (f"… and {more} more.",) if more > 0 else ()
+    """One row per stream, then one per row of job tables, as sentences that fit any terminal."""
+    streams, notes = _first(sorted(scenario.jobs, key=lambda stream: bool(stream.row)))
+    rows = tuple((s.name, f"{_work(s)}\nworth {s.value:g}, {_due(s)}; {_arrivals(scenario, s)}") for s in streams)
     return Table(head=("jobs", ""), rows=rows, numbers=False, notes=notes)
 
 
@@ -366,23 +378,25 @@ def _moment(scenario: Scenario, time_s: float) -> str:
     return moment_text(date_at(begin_of(scenario.shift_begin, scenario.time_zone), time_s), "%a %d %b %H:%M")
 
 
-def _absences(scenario: Scenario) -> str:
-    """Breaks and failures, a line each."""
-    lines = [
-        f"\nbreak '{each.name}' of {', '.join(each.arms) or 'all arms'}: "
-        f"{_moment(scenario, max(each.begin_s, 0.0))} to {_moment(scenario, each.end_s)}, "
-        f"after the present {each.finish}"
-        for each in scenario.breaks[:MOST_REASONS]
+def _absences(scenario: Scenario) -> list[str]:
+    """Breaks and failures, a sentence each."""
+    breaks, more_breaks = _first(scenario.breaks)
+    failing, more_failing = _first([(arm.name, arm.fails) for arm in scenario.arms if arm.fails is not None])
+    return [
+        *(
+            f"break '{each.name}' of {names_text(each.arms) or 'all arms'}: "
+            f"{_moment(scenario, max(each.begin_s, 0.0))} to {_moment(scenario, each.end_s)}, "
+            f"after the present {each.finish}"
+            for each in breaks
+        ),
+        *more_breaks,
+        *(
+            f"{arm} fails every {duration(fails.every_s)} of work and is repaired in "
+            f"{duration(fails.repair_s)}, both at random"
+            for arm, fails in failing
+        ),
+        *more_failing,
     ]
-    if len(scenario.breaks) > MOST_REASONS:
-        lines.append(f"\n… and {len(scenario.breaks) - MOST_REASONS} more breaks")
-    lines += [
-        f"\n{arm.name} fails every {duration(arm.fails.every_s)} of work and is repaired in "
-        f"{duration(arm.fails.repair_s)}, both at random"
-        for arm in scenario.arms
-        if arm.fails is not None
-    ]
-    return "".join(lines)
 
 
 def _arrivals(scenario: Scenario, stream: JobStream) -> str:

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
+from matplotlib.transforms import Bbox
 
 from fleet.arm.kinematics import FOREARM_M, HAND_M, REACH_M, UPPER_ARM_M
 from fleet.env.render.picture import FAULT, INK, outlines
@@ -29,6 +30,8 @@ ARM_NAME, JOB_NAME = 16, 30
 """Most characters of names in the picture; of jobs also places and scenarios."""
 LETTERS = 170
 """Of a line of problems, in a picture of full width."""
+LEAST_IN, MATRIX_IN, IN_PER_M = (7.6, 6.6), 5.4, 0.8
+"""Smallest width and height of a picture without exclusions, width of these, and the scale of large cells."""
 
 
 def draw_plan(file: Path, scenario: Scenario, report: LayoutReport) -> None:
@@ -39,9 +42,12 @@ def draw_plan(file: Path, scenario: Scenario, report: LayoutReport) -> None:
     lines = [
         line for each in report.problems for line in textwrap.wrap(f"✗ {each}", LETTERS if matrix else LETTERS // 2)
     ]
-    figure = Figure(figsize=(13.0 if matrix else 8.0, 6.6 + 0.2 * len(lines)), layout="constrained")
+    points_m = [each.position_m[:2] for each in (*scenario.arms, *scenario.places)]
+    wide, high = np.maximum(LEAST_IN, IN_PER_M * (np.ptp(points_m, axis=0) + 2 * REACH_M)).tolist()
+    widths = (wide, MATRIX_IN) if matrix else (wide,)
+    figure = Figure(figsize=(sum(widths), high + 0.2 * len(lines)), layout="constrained")
     FigureCanvasAgg(figure)
-    grid: Any = figure.add_gridspec(1, 2 if matrix else 1, width_ratios=(7, 5) if matrix else (1,))
+    grid: Any = figure.add_gridspec(1, len(widths), width_ratios=widths)
     axes = figure.add_subplot(grid[0])
     labels = _draw_cell(axes, scenario, report)
     if matrix:
@@ -87,7 +93,10 @@ def plan_page(scenario: Scenario, report: LayoutReport) -> str:
         ],
         "fixtures": [outline.tolist() for fixture in scenario.fixtures for outline in outlines(fixture)],
     }
-    drag = "Drag an arm by its base, or turn it by the tip of its arrow; with the arrow keys it moves by 1 cm."
+    drag = (
+        "Drag an arm by its base, or turn it by the tip of its arrow; with the arrow keys it moves by 1 cm. Names "
+        "without room are left out: point at a mark to read its name."
+    )
     red = (
         "Red until an arm is moved: places where no arm can work, and arms that can do no job. Afterwards, only the "
         "reach of the outstretched arm is judged."
@@ -146,28 +155,27 @@ class Label:
 
 
 def _write_labels(axes: Axes, labels: Sequence[Label]) -> None:
-    """Write each label on the side of its point where it covers the least of the points and of earlier labels."""
+    """Write each label on a side of its point where it covers no point and no other label; without one, leave it out.
+
+    Those in red come first.
+    """
     points = axes.transData.transform([label.at_m for label in labels])
-    taken = [(x - 6, y - 6, x + 6, y + 6) for x, y in points]
-    for label, (x, y) in zip(labels, points, strict=True):
-        lines = label.text.split("\n")
-        wide, high = 6.0 * max(map(len, lines)), 13.0 * len(lines)
-        beside, below = (x + 9, x - 9 - wide), (y - 9 - high, y + 9)
-        sides = [*((each, y - high / 2) for each in beside), *((x - wide / 2, each) for each in below)]
-
-        def covered(corner: tuple[float, float], wide: float = wide, high: float = high) -> float:
-            """Area that a label at this lower left corner covers, px²."""
-            overlaps = (
-                (min(corner[0] + wide, right) - max(corner[0], left), min(corner[1] + high, top) - max(corner[1], low))
-                for left, low, right, top in taken
-            )
-            return sum(max(0.0, a) * max(0.0, b) for a, b in overlaps)
-
-        left, low = min(sides, key=covered)
-        taken.append((left, low, left + wide, low + high))
-        aside = (left + wide / 2 - x, low + high / 2 - y)
+    taken = [Bbox.from_extents(x - 6, y - 6, x + 6, y + 6) for x, y in points]
+    named = [(label, *point) for label, point in zip(labels, points, strict=True) if label.text]
+    for label, x, y in sorted(named, key=lambda each: each[0].colour != FAULT):
         how: Any = {"ha": "center", "va": "center", "color": label.colour, "fontsize": 8, "zorder": 5}
-        axes.annotate(label.text, tuple(label.at_m), aside, textcoords="offset pixels", **how)
+        note = axes.annotate(label.text, tuple(label.at_m), (0, 0), textcoords="offset pixels", **how)
+        box = note.get_window_extent()
+        beside, below = 9 + box.width / 2, 9 + box.height / 2
+        for aside in ((beside, 0), (-beside, 0), (0, -below), (0, below)):
+            low = (x + aside[0] - box.width / 2, y + aside[1] - box.height / 2)
+            place = Bbox.from_bounds(*low, box.width + 3, box.height)
+            if not place.count_overlaps(taken):
+                note.set_position(aside)
+                taken.append(place)
+                break
+        else:
+            note.remove()
 
 
 def _draw_cell(axes: Axes, scenario: Scenario, report: LayoutReport) -> list[Label]:
@@ -207,7 +215,7 @@ def _draw_cell(axes: Axes, scenario: Scenario, report: LayoutReport) -> list[Lab
     axes.set_aspect("equal")
     axes.autoscale_view()
     axes.grid(color="#e6e6e6", zorder=-1)
-    axes.set(xlabel=f"x, m\n{LEGEND.format(height_m)}", ylabel="y, m")
+    axes.set(xlabel=f"x, m\n{LEGEND.format(height_m)}\nnames without room are left out", ylabel="y, m")
     title = shortened(scenario.name, JOB_NAME)
     axes.set_title(f"{title}: {len(report.at_once)} of {len(scenario.arms)} arms can work at once (lines)")
     return labels

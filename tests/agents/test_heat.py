@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from agents.heat import FuzzySpeed, GuardedArm, GuardedFleet, Shutdown, TorqueLimiter, Wsept
 from agents.pairs import PARAMETERS, LearnedPrices, Prices
 from agents.policy import WAIT, for_all_arms, one_fleet
-from agents.registry import WRAPPERS, make_policy
+from agents.registry import WRAPPERS, claims_no_late_jobs, make_policy
 from fleet.arm.model import ArmModel
 from fleet.env.allocation_v2 import parallel_env
 from fleet.errors import FleetError
@@ -48,6 +48,8 @@ def test_no_policy_by_worth_claims_a_job_that_would_end_100_min_late(name: str, 
     """Tardiness costs 1 % of the value a minute, so then nothing is left; docs/policies.md says so."""
     late = seen([1.0], [41.0, 41.0], left_s=1e6, due_in_s=np.array([FAST - 60.0 * late_min]))
     assert (action(name, late) != WAIT) == claims
+    assert claims_no_late_jobs(name)
+    assert claims_no_late_jobs(f"limited:{name}")
 
 
 def test_of_two_plans_the_cool_one_is_taken_only_where_the_fast_one_would_fault() -> None:

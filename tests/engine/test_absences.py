@@ -34,7 +34,7 @@ def test_an_arm_gives_its_job_back_after_the_cycle_in_which_a_break_begins(small
     assert times(log, "award") == [0.0, 60.0]
     assert times(log, "finish") == [60.0 + 3.0 + 3 * 10.0]
     assert (times(log, "break"), times(log, "break_end")) == ([30.0], [60.0])
-    assert [e.value for e in log if e.kind == "break"] == [30.0]
+    assert [(e.value, e.reason) for e in log if e.kind == "break"] == [(30.0, "for 0.5 min")]
     assert steps[3].state.status[0, 0] == WAITING
 
 
@@ -53,6 +53,7 @@ def test_a_failure_stops_an_arm_at_once_and_keeps_whole_cycles(small) -> None:
     """At 50 s it is 47 s into the cycles: four are kept. It is repaired at 90 s."""
     limits = ThermalLimits(clear_s=5.0, move_home_s=15.0)
     log, steps, _ = shift(small, [(0, 5, 9, BROKEN)], [[CLAIM]] * 30, limits=limits)
+    assert [e.reason for e in log if e.kind == "failure"] == ["not by heat; repaired after 0.7 min"]
     assert [(e.time_s, e.value) for e in log if e.kind in ("failure", "return")] == [(50.0, 40.0), (50.0, 4.0)]
     assert times(log, "moved") == [65.0]
     assert times(log, "recover") == [90.0]

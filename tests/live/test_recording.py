@@ -44,7 +44,8 @@ from scenarios.live.recording import CARD, SOURCES, alarms_of, open_messages, re
 from scenarios.live.recording_report import NO_STATES, epochs_of, heat_use, open_recording, order_events
 from scenarios.result_folder import lock_folder
 from scenarios.run.records import JobRecord, ShiftLog, schedule
-from scenarios.show.run_page import late_jobs, lateness_text, report_html, verdict
+from scenarios.show.late_jobs import late_jobs, lateness_text
+from scenarios.show.run_page import report_html, verdict
 from tests.commands import call
 from tests.profiles import examples
 from tests.waiting import PATIENCE_S, serve_until, wait_until

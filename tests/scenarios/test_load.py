@@ -16,15 +16,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 
 from fleet.arm.cell import ContactFinder
 from fleet.arrivals import Arrivals
 from fleet.errors import FleetError, ScenarioError
 from fleet.events import Event
-from fleet.job import Fixture
+from fleet.job import Fixture, Work
 from scenarios.prepare.fleet import prepare, prepare_arm
 from scenarios.run.shift import run
-from scenarios.show.layout import MOST_REASONS, LayoutReport, Reach, describe, layout_parts, layout_report
+from scenarios.show.layout import LayoutReport, Reach, describe, layout_parts, layout_report
 from scenarios.show.plan import draw_plan
 from scenarios.show.run_page import figure_table
 from scenarios.spec.jobs import all_works, draw_jobs, rehearsal_works, works_of
@@ -395,6 +396,24 @@ def test_three_arms_of_every_library_cell_can_work_at_once(name):
     assert report.excluded_share < 0.3
 
 
+def test_a_layout_after_a_run_compares_no_motions_and_makes_the_tasks_once(monkeypatch) -> None:
+    scenario = cell(*APART, places={**BESIDE, "middle": PLACES["middle"]})
+    prepare(scenario, difficulty="blind")
+    made = list[Scenario]()
+
+    def works(scenario: Scenario) -> tuple[Work, ...]:
+        made.append(scenario)
+        return all_works(scenario)
+
+    def compare(*_: object) -> bool:
+        raise AssertionError("compared anew")
+
+    monkeypatch.setattr("scenarios.show.layout.all_works", works)
+    monkeypatch.setattr("fleet.arm.clearance.conflict", compare)
+    assert len(layout_report(scenario).reach) == 2 * 3
+    assert len(made) == 1
+
+
 def test_a_large_layout_names_the_first_reasons_and_counts_the_others() -> None:
     scenario = load("quickstart")
     names = [place.name for place in scenario.places]
@@ -413,10 +432,28 @@ def test_a_large_layout_names_the_first_reasons_and_counts_the_others() -> None:
         largest=True,
         problems=(),
     )
-    _, reasons, *_ = layout_parts(scenario, report)
+    places, reasons, *_ = layout_parts(scenario, report)
+    assert isinstance(places, Table)
     assert isinstance(reasons, Table)
-    assert len(reasons.rows) == MOST_REASONS + 1
-    assert reasons.rows[-1] == (f"… and {len(reach) - MOST_REASONS} more", "all with --json")
+    assert places.rows == tuple((name, "none") for name in names)
+    assert len(reasons.rows) == 12
+    assert reasons.notes == (f"… and {len(reach) - 12} more; --json has all.",)
+
+
+def test_a_description_has_the_streams_before_the_first_rows_of_a_job_table(tmp_path) -> None:
+    """Of the jobs: one stream and 300 rows of a table, which is named before the stream. And 30 breaks."""
+    lines = ["name,kind,places,payload,repetitions,release,due"]
+    lines += [f"part_{number},hold,bench,0.5,1,0,900" for number in range(300)]
+    (tmp_path / "parts.csv").write_text("\n".join(lines), encoding="utf-8")
+    raw = small()
+    raw["jobs"] = [{"table": "parts.csv"}, {**raw["jobs"][0], "name": "stream"}]
+    raw["breaks"] = [{"name": f"break_{n}", "begin_s": 1.0 * n, "end_s": n + 90.0} for n in range(30)]
+    head, _, jobs, _ = describe(parse_scenario(raw, tmp_path / "heat.toml"))
+    assert isinstance(jobs, Table)
+    assert [name for name, _ in jobs.rows] == ["stream", *(f"part_{number}" for number in range(11))]
+    assert jobs.notes == ("… and 289 more; --json has all.",)
+    assert str(head).count("\nbreak 'break_") == 12
+    assert str(head).endswith("\n… and 18 more; --json has all.")
 
 
 @pytest.mark.parametrize("name", [cell for cell in CELLS if cell.values != ("scale_64",)])
@@ -500,6 +537,30 @@ def test_the_hour_that_occurs_twice_has_its_zone():
     )
     told = " ".join(map(str, describe(night)))
     assert "3 at Sun 25 Oct 02:15 CEST, Sun 25 Oct 02:15 CET, Sun 25 Oct 03:15" in told
+
+
+def test_names_in_the_picture_of_a_long_row_cover_no_other_name_and_arms_come_first(tmp_path, monkeypatch) -> None:
+    """30 arms and 60 places in a row of 19 m: all arms have their names, and some of the places."""
+    xs_m = np.linspace(-9.5, 9.5, 30).tolist()
+    arms = [arm(f"arm_{n}", x, 0.0, 90.0) for n, x in enumerate(xs_m)]
+    places = {f"left_{n}": (x - 0.12, 0.45, 0.25) for n, x in enumerate(xs_m)}
+    scenario = cell(*arms, places={**places, **{f"right_{n}": (x + 0.12, 0.45, 0.25) for n, x in enumerate(xs_m)}})
+    reach = tuple(
+        Reach(arm=one.name, place=at.name, payload_kg=1.0, lacks_m=0.0)
+        for one in scenario.arms
+        for at in scenario.places
+    )
+    empty = {"exclusions": (), "at_once": (), "problems": ()}
+    report = LayoutReport(scenario="a", clearance_m=0.0, reach=reach, excluded_share=0.0, largest=True, **empty)
+    figures = list[Figure]()
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
+    draw_plan(tmp_path / "row.png", scenario, report)
+    notes = [text for text in figures[0].axes[0].texts if text.get_text()]
+    boxes = [note.get_window_extent() for note in notes]
+    assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+    names = [note.get_text() for note in notes]
+    assert {each.name for each in scenario.arms} <= {*names}
+    assert 30 < len(names) < 90
 
 
 @pytest.mark.filterwarnings("error")  # matplotlib's, that the names leave no room for the figure

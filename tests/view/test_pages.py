@@ -218,6 +218,42 @@ def test_words_have_contrast_in_light_and_dark(open_page, run_folder: Path) -> N
             assert (bright + 0.05) / (dim + 0.05) >= 4.5, (scheme, selector, colours)
 
 
+def test_names_in_a_long_row_overlap_nothing_and_every_mark_has_its_name(open_page) -> None:
+    """30 arms and 60 places in a row of 19 m; one place, in the middle, is red and has its name first."""
+    arm, place, xs_m = load("quickstart").arms[0], load("quickstart").places[0], np.linspace(-9.5, 9.5, 30)
+    arms = tuple(replace(arm, name=f"arm_{n}", position_m=(x, 0.0, 0.0)) for n, x in enumerate(xs_m))
+    places = tuple(
+        replace(place, name=f"{side}_{n}", position_m=(x + aside_m, 0.45, 0.25))
+        for n, x in enumerate(xs_m)
+        for side, aside_m in (("left", -0.12), ("right", 0.12))
+    )
+    scenario = replace(load("quickstart"), arms=arms, places=places)
+    reach = tuple(
+        Reach(arm=one.name, place=at.name, payload_kg=None if at.name == "left_15" else 1.0, lacks_m=0.0)
+        for one in arms
+        for at in places
+    )
+    empty = {"exclusions": (), "at_once": (), "problems": ()}
+    report = LayoutReport(scenario="a", clearance_m=0.0, reach=reach, excluded_share=0.0, largest=True, **empty)
+    page = open_page(plan_page(scenario, report), viewport={"width": 1400, "height": 900})
+    labels = [label for label in page.locator("#plan text").all() if label.is_visible()]
+    marks = [*labels, *page.locator(".arm rect, .arm .tip, .place polygon").all()]
+    boxes = [box for mark in marks if (box := mark.bounding_box())]
+    assert len(boxes) == len(labels) + 2 * len(arms) + len(places)
+    for number, one in enumerate(boxes[: len(labels)]):
+        for other in boxes[number + 1 :]:
+            apart = (
+                max(one[axis], other[axis]) - min(one[axis] + one[size], other[axis] + other[size])
+                for axis, size in (("x", "width"), ("y", "height"))
+            )
+            assert max(apart) > -0.1, (one, other)  # px
+    names = [label.text_content() or "" for label in labels]
+    assert "left_15: no arm can work here" in names
+    assert sum(name.startswith("arm_") for name in names) >= 15
+    titles = page.locator("#plan title").all_text_contents()
+    assert {title.split(":")[0] for title in titles} == {each.name for each in (*arms, *places)}
+
+
 def test_a_moved_and_turned_arm_reaches_what_the_lines_to_paste_say(open_page) -> None:
     """`shoulder_m` of the changed arms tells the distance that places lack; the arm hangs at a wall."""
     first, *_ = load("quickstart").arms

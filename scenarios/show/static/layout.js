@@ -17,8 +17,9 @@ function startLayout() {
   const points = [...cell.fixtures.flat(), ...cell.places.map((each) => each.at), ...cell.arms.map((each) => each.base)];
   const [left, right] = [Math.min, Math.max].map((most) => most(...points.map((point) => point[0])));
   const [low, high] = [Math.min, Math.max].map((most) => most(...points.map((point) => point[1])));
-  const room = 1, size = Math.max(right - left, high - low) + 2 * room, text = size / 65;
+  const room = 1, textPx = 11;
   svg.setAttribute("viewBox", [left - room, -high - room, right - left + 2 * room, high - low + 2 * room].join(" "));
+  const text = textPx / svg.getScreenCTM().a;
   svg.style.fontSize = `${text}px`;
   for (const corners of cell.fixtures)
     draw(svg, "polygon", { class: "fixture", points: corners.map(([x, y]) => `${x},${-y}`).join(" ") });
@@ -41,9 +42,9 @@ function startLayout() {
     const [x, y] = [place.at[0], -place.at[1]];
     place.mark = draw(svg, "g", { class: "place", "data-place": place.name });
     const corners = [[-1, 0], [0, -1], [1, 0], [0, 1]].map(([a, b]) => `${x + a * text * 0.5},${y + b * text * 0.5}`);
-    draw(place.mark, "polygon", { points: corners.join(" ") });
-    place.label = draw(place.mark, "text", { x: x + text * 0.8, y: y + text * 0.35 });
-    place.who = draw(place.mark, "title", {});
+    place.body = draw(place.mark, "polygon", { points: corners.join(" ") });
+    place.label = draw(place.mark, "text", {});
+    place.title = draw(place.mark, "title", {});
   }
   for (const arm of cell.arms) {
     arm.mark = draw(svg, "g", { class: "arm", tabindex: 0, "data-arm": arm.name, fill: arm.colour });
@@ -51,7 +52,8 @@ function startLayout() {
     arm.arrow = draw(arm.mark, "line", { class: "arrow", "stroke-width": text * 0.15 });
     arm.body = draw(arm.mark, "rect", { width: 2 * text, height: 2 * text, rx: text * 0.3 });
     arm.tip = draw(arm.mark, "circle", { class: "tip", r: text * 0.45 });
-    arm.label = draw(arm.mark, "text", { class: "name" }, arm.name);
+    arm.label = draw(arm.mark, "text", { class: "name" });
+    arm.title = draw(arm.mark, "title", {});
     const move = (at) => { arm.base = [round(at[0], 2), round(at[1], 2), arm.base[2]]; };
     drag(arm.body, move);
     drag(arm.tip, ([x, y]) => {
@@ -77,6 +79,33 @@ function startLayout() {
     });
   }
 
+  // Whether two boxes overlap, or have less than a gap between them from left to right.
+  const gap = text * 0.2, near = 0.9 * gap;
+  const overlap = (a, b) =>
+    a.x < b.x + b.width + near && b.x < a.x + a.width + near && a.y < b.y + b.height && b.y < a.y + a.height;
+
+  // Each label goes to a side of its mark where it covers neither a mark nor another label; without one it is left out.
+  // Those in red come first, then those of arms.
+  function placeLabels() {
+    const marks = [...cell.arms, ...cell.places];
+    const taken = [...marks.map((each) => each.body), ...cell.arms.map((arm) => arm.tip)].map((mark) => mark.getBBox());
+    const isRed = ({ mark }) => mark.matches(".unable, .lacks");
+    for (const { body, label } of [...marks.filter(isRed), ...marks.filter((each) => !isRed(each))]) {
+      const mark = body.getBBox(), { y, width, height } = label.getBBox(), ascent = label.getAttribute("y") - y;
+      const middle = [mark.x + (mark.width - width) / 2, mark.y + (mark.height - height) / 2];
+      const sides = [
+        [middle[0], mark.y + mark.height + gap], [mark.x + mark.width + gap, middle[1]],
+        [mark.x - width - gap, middle[1]], [middle[0], mark.y - height - gap],
+      ].map(([left, top]) => ({ x: left, y: top, width, height }));
+      const free = sides.find((side) => !taken.some((other) => overlap(side, other)));
+      label.style.visibility = free ? "visible" : "hidden";
+      if (!free) continue;
+      label.setAttribute("x", free.x);
+      label.setAttribute("y", free.y + ascent);
+      taken.push(free);
+    }
+  }
+
   const isMoved = (arm) => far(arm.base, arm.first) > 0;
 
   // Until an arm is moved, the remarks of the command hold; they cover more than reach.
@@ -90,18 +119,19 @@ function startLayout() {
       set(arm.arrow, { x1: x, y1: -y, x2: x + c, y2: -y - d });
       set(arm.body, { x: x - text, y: -y - text });
       set(arm.tip, { cx: x + c, cy: -y - d });
-      set(arm.label, { x, y: -y + text * 2.1 });
       arm.mark.classList.toggle("unable", checked && arm.remark !== "");
-      arm.label.textContent = checked && arm.remark ? `${arm.name}: ${arm.remark}` : arm.name;
+      arm.title.textContent = arm.label.textContent = checked && arm.remark ? `${arm.name}: ${arm.remark}` : arm.name;
     }
     for (const place of cell.places) {
       const farther = cell.arms.map((arm) => far(shoulder(arm), place.at) - cell.reach_m), lacks = Math.min(...farther);
       const near = cell.arms.filter((arm, i) => farther[i] <= 0).map((arm) => arm.name);
       const remark = checked ? place.remark : lacks > 0 ? `lacks ${Math.max(lacks, 0.01).toFixed(2)} m` : "";
-      place.who.textContent = checked ? `${place.able.join(", ") || "no arm"} can work here` : `in reach of ${near.join(", ") || "no arm"}`;
+      const who = checked ? `${place.able.join(", ") || "no arm"} can work here` : `in reach of ${near.join(", ") || "no arm"}`;
+      place.title.textContent = `${place.name}: ${who}`;
       place.mark.classList.toggle("lacks", remark !== "");
       place.label.textContent = remark ? `${place.name}: ${remark}` : place.name;
     }
+    placeLabels();
     changes.value = cell.arms.flatMap((arm) => {
       const moved = isMoved(arm), tilt = [arm.tilt[0], arm.tilt[1], round(arm.tilt[2] + arm.turn, 6)];
       if (tilt[2] > 180) tilt[2] = round(tilt[2] - 360, 6);

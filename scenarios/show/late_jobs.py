@@ -1,0 +1,316 @@
+"""Late jobs, and jobs that waited at the end of a shift beside idle arms, with the reasons."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
+
+import numpy as np
+
+from agents.registry import WORTHLESS_MIN, claims_no_late_jobs
+from fleet.events import Event
+from scenarios.run.records import Halt, JobSpan, Outage, ShiftLog
+from scenarios.show.words import clock, duration, names_text
+from scenarios.table import Table
+
+IDLE_S = 900.0
+"""Time for which an arm without a job, beside a job that it can do, is worth a sentence."""
+MOST_LATE = 50
+"""Rows of the table of late jobs."""
+PAUSED = "had a break"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Standstill:
+    """Jobs that waited at the end of a shift while arms had long been idle."""
+
+    waiting: int
+    """Number of all jobs that waited at the end."""
+    jobs: tuple[str, ...]
+    """Those that waited for no other job, and that one of the arms can do by the record."""
+    arms: tuple[str, ...]
+    since_s: float
+    """From then on all of these arms were idle, and each could do one of the jobs; NaN without arms."""
+    unknown: tuple[str, ...] = ()
+    """Jobs that waited as long, of which no record states which arms can do them."""
+
+    @property
+    def badge(self) -> str:
+        """What was left, in a few words."""
+        some = f", {len(self.jobs)} of them" if len(self.jobs) < self.waiting else ""
+        return f"{_count_jobs(self.waiting)} left waiting{f'{some} beside idle arms' if self.jobs else ''}"
+
+
+def _count_jobs(number: int) -> str:
+    return f"{number} job{'s' * (number > 1)}"
+
+
+def standstill(log: ShiftLog) -> Standstill | None:
+    """The standstill at the end of a finished shift; None if there was none, or for less than `IDLE_S`."""
+    if log.card.get("status") != "finished":
+        return None
+    end_s = min(log.plan.horizon_s, log.ended_s)
+    spans = (*log.plan.assignments, *log.plan.outages, *log.plan.breaks)
+    idle_s = {arm: max((span.end_s for span in spans if span.arm == arm), default=0.0) for arm in log.arms}
+    for halt in log.halts:
+        idle_s |= {arm: max(idle_s[arm], halt.end_s) for arm in log.arms if halt.arm in ("", arm)}
+    absent = np.all(np.isnan(log.readings.temp_c), axis=-1)
+    for a, arm in enumerate(log.arms):
+        idle_s[arm] = max(idle_s[arm], float(log.readings.time_s[absent[:, a]].max(initial=0.0)))
+    waiting = [job for job in log.jobs if job.state == "waiting" and not job.release_s > end_s]
+    jobs, unknown, since_s = set[str](), set[str](), dict[str, float]()
+    for job, job_s in ((record.job, log.ready_s(record)) for record in waiting):
+        able = log.able_arms(job)
+        for arm in log.arms if able is None else able:
+            both_s = max(job_s, idle_s[arm])
+            waited = end_s - both_s >= IDLE_S  # not if its release is unknown
+            if waited and able is None:
+                unknown.add(job)
+            elif waited:
+                jobs.add(job)
+                since_s[arm] = min(both_s, since_s.get(arm, math.inf))
+    if not jobs and not unknown:
+        return None
+    return Standstill(
+        waiting=len(waiting),
+        jobs=tuple(sorted(jobs)),
+        arms=tuple(arm for arm in log.arms if arm in since_s),
+        since_s=max(since_s.values(), default=math.nan),
+        unknown=tuple(sorted(unknown)),
+    )
+
+
+def standstill_text(log: ShiftLog, stood: Standstill) -> str:
+    """How many jobs waited, how many of them beside which arms since when, and of how many too little is recorded."""
+    text = f"{_count_jobs(stood.waiting)} still waited at the end"
+    if stood.jobs:
+        some = f"{len(stood.jobs)} of them " if len(stood.jobs) < stood.waiting else ""
+        be = "were" if len(stood.arms) > 1 else "was"
+        text += (
+            f", {some}though {names_text(stood.arms)} {be} idle from {clock(stood.since_s, log.begin)} to the end: "
+            "run another policy"
+        )
+    if stood.unknown:
+        text += (
+            f". {_count_jobs(len(stood.unknown))} waited for at least {duration(IDLE_S)}; which arms can do "
+            f"{'them' if len(stood.unknown) > 1 else 'it'} is not recorded"
+        )
+    return f"{text}."
+
+
+@dataclass(frozen=True, kw_only=True)
+class LateJob:
+    """A job that passed its due date."""
+
+    job: str
+    due_s: float
+    late_s: float
+    """Tardiness; of an unfinished job until the end of the shift."""
+    state: str
+    """As in `JobRecord`."""
+
+    @property
+    def abandoned(self) -> bool:
+        """Whether it left the queue unfinished."""
+        return self.state in ("given_up", "expired")
+
+
+def late_jobs(log: ShiftLog) -> list[LateJob]:
+    """Jobs that passed their due date, finished or not but not cancelled: the latest first, abandoned ones last."""
+    end_s = min(log.plan.horizon_s, log.ended_s)
+    finished = {event.job for event in log.events if event.kind == "finish"}  # its result may not be recorded yet
+    late = [
+        LateJob(job=event.job, due_s=event.time_s - event.value, late_s=event.value, state="finished")
+        for event in log.events
+        if event.kind == "finish" and event.value > 0
+    ]
+    late += [
+        LateJob(job=job.job, due_s=job.due_s, late_s=end_s - job.due_s, state=job.state)
+        for job in log.jobs
+        if job.state not in ("finished", "cancelled") and job.job not in finished and job.due_s < end_s
+    ]
+    return sorted(late, key=lambda each: (each.abandoned, -each.late_s, each.job))
+
+
+def lateness_text(log: ShiftLog, late: Sequence[LateJob]) -> str:
+    """The first of one or more late jobs with the reason, in a sentence, and the number of all."""
+    first, finished = late[0], sum(each.state == "finished" for each in late)
+    over = duration(first.late_s)
+    how = f"finished {over} late" if first.state == "finished" else f"is unfinished {over} after its due date"
+    if first.abandoned:
+        how = f"was abandoned, due at {clock(first.due_s, log.begin)}"
+    if len(late) == 1:
+        return f"{first.job} {how}: {_reason(log, first)}."
+    counts = ((finished, "finished late"), (len(late) - finished, "unfinished at the due date"))
+    jobs = ", ".join(f"{number} {what}" for number, what in counts if number)
+    return f"Late jobs: {jobs}. The latest, {first.job}, {how}: {_reason(log, first)}."
+
+
+def late_table(log: ShiftLog) -> Table | None:
+    """The late jobs, with their reasons; None if there are none."""
+    late = late_jobs(log)
+
+    def row(each: LateJob) -> tuple[str, ...]:
+        over = "" if each.abandoned else duration(each.late_s)
+        return each.job, clock(each.due_s, log.begin), over, each.state.replace("_", " "), _reason(log, each)
+
+    rows = tuple(map(row, late[:MOST_LATE]))
+    caption = f"The first {MOST_LATE} of {len(late)}." if len(late) > MOST_LATE else ""
+    head = ("job", "due", "late by", "state", "why")
+    return Table(head=head, rows=rows, caption=caption, numbers=False) if late else None
+
+
+def _reason(log: ShiftLog, late: LateJob) -> str:
+    """What delayed a job most: its own work, or what the arms that can do it did while it waited."""
+    own = sorted((span for span in log.plan.assignments if span.job == late.job), key=lambda span: span.start_s)
+    for span in own:
+        if span.outcome in ("returned", "given_up"):
+            absence = next((e for e in log.events if _absence_in(span, e)), None)
+            if absence is not None:
+                what = "had a break" if absence.kind == "break" else "failed, not by heat,"
+                return f"{span.arm} {what} at {clock(absence.time_s, log.begin)}"
+            how = f"{span.arm} {'faulted during' if span.faulted else 'returned'} it at {clock(span.end_s, log.begin)}"
+            return how if span.faulted else f"{how}{_return_reason(log, span)}"
+    if late.state == "given_up" and not own:
+        why = next((e.reason for e in log.events if e.kind == "give_up" and e.job == late.job), "")
+        return why or "a job before it was given up"
+    begin_s = next((job.release_s for job in log.jobs if job.job == late.job), math.nan)
+    if math.isnan(begin_s):
+        return "its release is not recorded"
+    end_s = own[0].start_s if own else late.due_s if late.state == "expired" else log.plan.horizon_s
+    took_s = (own[0].finished_s or own[0].end_s) - end_s if own else 0.0
+    if begin_s + took_s > late.due_s:
+        wait_s = late.due_s - begin_s
+        due = f"{duration(abs(wait_s))} {'after' if wait_s >= 0 else 'before'} its release"
+        return f"its work takes {duration(took_s)}, and it was due {due}" if own else f"it was due {due}"
+    last, ready_s = log.last_before.get(late.job, (log.records[late.job], -math.inf))
+    # One that never began waited for other reasons afterwards, if that was longer.
+    if (own and ready_s > late.due_s) or ready_s - begin_s > (end_s - begin_s) / 2:
+        if math.isfinite(ready_s):
+            return f"it waited for {last.job}, which finished at {clock(ready_s, log.begin)}"
+        return f"it waits for {last.job}, which is not finished ({last.state.replace('_', ' ')})"
+    begin_s = max(begin_s, ready_s)
+    able = log.able_arms(late.job)
+    if not able:
+        return "it was never awarded, and no offer for it or for a job with the same work is recorded"
+    halts = {halt_text(log, halt): halt for halt in log.halts if halt.start_s < late.due_s}
+    worthless = not own and end_s - late.due_s >= 60.0 * WORTHLESS_MIN and claims_no_late_jobs(log.policy)
+    rule = f"; {log.policy} begins no job that would end {WORTHLESS_MIN:g} min late" if worthless else ""
+    waits_s = _arm_time(log, able, begin_s, end_s, halts, rule)
+    if all(each.start_s >= late.due_s for each in log.plan.breaks):
+        waits_s.pop(PAUSED)  # it was late before
+    most = max(waits_s, key=lambda why: sum(waits_s[why].values()))
+    longest = {arm: max(halts, key=lambda why: waits_s[why][arm]) for arm in able} if halts else {}
+    halted_s = {arm: waits_s[why][arm] for arm, why in longest.items()}
+    if 0 < sum(halted_s.values()) >= sum(waits_s[most].values()):
+        return names_text(list(dict.fromkeys(longest[arm] for arm in able if halted_s[arm] > 0)))
+    arms = [arm for arm, time_s in waits_s[most].items() if time_s > 0]
+    if not arms:
+        return f"what {names_text(able)} did meanwhile is not recorded"
+    if not most:
+        return _passed(log, late, able, begin_s, end_s)
+    be = "" if most == PAUSED else "were " if len(arms) > 1 else "was "
+    return f"{names_text(arms)} {be}{most}"
+
+
+def _absence_in(span: JobSpan, event: Event) -> bool:
+    """Whether an event is a break or failure of the arm of a span that begins in it."""
+    begins = event.kind in ("break", "failure") and event.arm == span.arm
+    return begins and span.start_s <= event.time_s <= span.end_s
+
+
+def halt_text(log: ShiftLog, halt: Halt) -> str:
+    """What kept an arm, or all of them, from getting jobs, and when."""
+    until = f"to {clock(halt.end_s, log.begin)}" if halt.end_s < log.plan.horizon_s else "to the end"
+    return f"{halt.reason} from {clock(halt.start_s, log.begin)} {until}"
+
+
+def _return_reason(log: ShiftLog, span: JobSpan) -> str:
+    """Why an arm returned a job, after a colon; "" if it is unknown."""
+    key = "return", span.arm, span.job, span.end_s
+    reason = next((e.reason for e in log.events if (e.kind, e.arm, e.job, e.time_s) == key), "").rstrip(".")
+    return f": {reason[0].lower()}{reason[1:]}" if reason else ""
+
+
+def _passed(log: ShiftLog, late: LateJob, able: Sequence[str], begin_s: float, end_s: float) -> str:
+    """How many jobs were awarded before a late one to arms that can do it, and what most of them have in common."""
+    ahead = [s for s in log.plan.assignments if s.arm in able and begin_s <= s.start_s < end_s and s.job != late.job]
+    records = log.records
+    took_s = {(o.arm, o.job, o.time_s): o.duration_s for o in log.offers if o.duration_s}
+    like = [s for (_, job, _), s in took_s.items() if job == late.job]
+    own = records.get(late.job)
+    if own is not None and not like and (work := log.work(late.job)):  # by the time per cycle of the same work
+        alike = [(s, records[job]) for (_, job, _), s in took_s.items() if job in records and log.work(job) == work]
+        like = [s / record.cycles * own.cycles for s, record in alike if record.cycles]
+    own_s = median(like) if like else 0.0
+    counts = dict.fromkeys(("shorter", "worth more", "due earlier", "worth more per minute"), 0)
+    for span in ahead:
+        span_s = took_s.get((span.arm, span.job, span.start_s), math.inf)
+        counts["shorter"] += span_s < own_s
+        if own is not None and (other := records.get(span.job)) is not None:
+            counts["worth more"] += other.value > own.value
+            counts["due earlier"] += other.due_s < own.due_s
+            counts["worth more per minute"] += other.value * own_s > own.value * span_s
+    most = max(counts, key=lambda trait: counts[trait])
+    share = "all" if counts[most] == len(ahead) else str(counts[most])
+    which = f", {share} of them {most}" if 2 * counts[most] > len(ahead) else ""
+    arms = [arm for arm in log.arms if any(span.arm == arm for span in ahead)]
+    return f"{len(ahead)} other job{'s' * (len(ahead) > 1)} went first on {names_text(arms)}{which}"
+
+
+def _arm_time(
+    log: ShiftLog, able: Sequence[str], begin_s: float, end_s: float, halts: Mapping[str, Halt], rule: str
+) -> dict[str, dict[str, float]]:
+    """Time of each arm that can do a job between its release and its award, s, by what the arm did, or by what kept it
+    from getting jobs; "": later jobs.
+
+    Args:
+        rule: Why the policy let the job wait, if it is known; added to what is said of idle arms.
+    """
+    slots = int(log.card.get("scenario", {}).get("slots", 0))
+    waiting = _most_waiting(log, begin_s, end_s)
+    earlier, out, failed = "at work since before its release", "out after a fault", "out after a failure"
+    hot, idle = "idle above the warning limit", "idle: the job's place was taken, or the policy let the job wait"
+    if 0 < slots < waiting:  # which jobs had the slots is not recorded
+        idle = f"{idle}, or it had no slot ({slots} for up to {waiting} waiting jobs)"
+    idle += rule
+    absent = "absent, or no state was recorded"
+    whys = (*halts, "", earlier, out, failed, PAUSED, hot, idle, absent)
+    time_s = {why: dict.fromkeys(able, 0.0) for why in whys}
+    at_s = log.readings.time_s
+    step_s = float(np.median(np.diff(at_s))) if len(at_s) > 1 else 0.0
+    for arm in able:
+        spans = [(s, earlier if s.start_s < begin_s else "") for s in log.plan.assignments if s.arm == arm]
+        spans += [(each, out if each.kind == "fault" else failed) for each in log.plan.outages if each.arm == arm]
+        spans += [(each, PAUSED) for each in log.plan.breaks if each.arm == arm]
+        kept = [(halt, why) for why, halt in halts.items() if halt.arm in ("", arm)]
+        free = (at_s >= begin_s) & (at_s < end_s)
+        for span, why in [*kept, *spans]:
+            halted_s = 0.0 if why in halts else sum(_common_s(begin_s, end_s, span, halt) for halt, _ in kept)
+            time_s[why][arm] += _common_s(begin_s, end_s, span) - halted_s
+            free &= (at_s < span.start_s) | (at_s >= span.end_s)
+        peak_c = np.fmax.reduce(log.readings.temp_c[free, log.arms.index(arm)], axis=-1, initial=-math.inf)
+        time_s[hot][arm] += step_s * float((peak_c >= log.limits.warning_c).sum())
+        time_s[absent][arm] += step_s * float(np.isneginf(peak_c).sum())
+        time_s[idle][arm] += step_s * float((np.isfinite(peak_c) & (peak_c < log.limits.warning_c)).sum())
+    return time_s
+
+
+def _most_waiting(log: ShiftLog, begin_s: float, end_s: float) -> int:
+    """Largest number of jobs that waited for nothing but an arm at one time, by their first awards."""
+    ends_s = dict[str, float]()
+    for event in sorted(log.events, key=lambda event: event.time_s):
+        if event.kind in ("award", "expire", "give_up", "cancel"):
+            ends_s.setdefault(event.job, event.time_s)
+    changes = [(log.ready_s(record), 1) for record in log.jobs if log.ready_s(record) < end_s]
+    changes += [(ends_s[record.job], -1) for record in log.jobs if ends_s.get(record.job, math.inf) < end_s]
+    count = most = 0
+    for time_s, change in sorted(changes):
+        count += change
+        most = max(most, count) if time_s >= begin_s else count
+    return most
+
+
+def _common_s(begin_s: float, end_s: float, *spans: JobSpan | Outage | Halt) -> float:
+    """Time that some spans have in common between two times, s."""
+    return max(0.0, min(end_s, *(span.end_s for span in spans)) - max(begin_s, *(span.start_s for span in spans)))
