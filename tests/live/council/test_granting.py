@@ -457,6 +457,22 @@ def test_space_of_a_finished_job_stays_taken_until_the_arm_is_home(granting):
     assert granting.claim("b", "p2") == []
 
 
+def test_space_of_a_job_that_its_arm_still_claims_stays_taken_when_the_claim_is_denied(granting):
+    """The claim may have been sent from home, and the arm may have left since, under the lease of a majority."""
+    granting.claim("a", "p1", phase="working")
+    granting.claim("b", outcomes=[JobOutcome("p1", "a: p1", "a", "finished", 1, 9.0)])
+    assert granting.claim("a", "p1", phase="working") == ["'p1' is settled"]
+    assert granting.claim("b", "p2") == ["'a' is in the way"]
+    granting.claim("a")
+    assert granting.claim("b", "p2") == []
+
+
+def test_a_denied_request_takes_no_space(granting):
+    granting.claim("a", "p1")
+    assert granting.claim("b", "p2") == ["'a' is in the way"]
+    assert granting.claim("a", "p3") == []
+
+
 def test_an_arm_without_a_claim_or_that_does_not_say_where_it_is_may_be_anywhere():
     granting = Granting()
     granting.records.clear()
