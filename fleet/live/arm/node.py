@@ -662,10 +662,7 @@ class ArmNode:
 
     def _advance(self, until_s: float, current: ActiveAward | None, leased_s: float, real_s: float) -> None:
         if current is not None and self._body_award == current.award.award:
-            allowed = self.executor.allowed_cycles(leased_s)
-            if self._waits_to_commit(current, real_s):
-                allowed = current.cycles  # leaving home just to come back for the last cycle would be wasted
-            self._body.allow_cycles(allowed)
+            self._body.allow_cycles(self.executor.allowed_cycles(leased_s))
         for event in self._body.advance(until_s):
             self._handle_event(event, real_s)
         if self._reading.mode == "faulted" and self.executor.active:
@@ -678,11 +675,6 @@ class ArmNode:
                 self._estimator.learn(current.award.job, excess)
             cycles = self._body.cycles if at_work else current.cycles
             self.executor.record_progress(cycles, self._last_cycle_in_s(current) / self.clock.speed)
-
-    def _waits_to_commit(self, current: ActiveAward, real_s: float) -> bool:
-        """Whether the arm is at home, its last cycle is near, and permission to commit may arrive at any moment."""
-        near = current.last_cycle_in_s <= self.executor.config.commit_lead_s and not current.may_commit
-        return near and self._reading.mode != "working" and real_s < current.lease_end_s
 
     def _last_cycle_in_s(self, current: ActiveAward) -> float:
         """Fleet seconds until the last cycle of the current job could begin."""
