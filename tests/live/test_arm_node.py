@@ -186,17 +186,36 @@ def test_a_job_goes_from_quote_to_receipt(make):
 
 
 def test_an_idle_arm_publishes_twice_a_second_and_a_working_one_at_its_rate(make, monkeypatch):
-    """Rates by definition: 2 and 20 Hz. The first state of a job does not wait for the period of an idle arm."""
-    arm, states = make(), []
+    """Rates by definition: 2 and 20 Hz. The first state of a job does not wait for the period of an idle arm.
+
+    An idle arm makes one step for each state: ten times fewer than a working one, which is what it costs.
+    """
+    arm, states, steps = make(), [], []
+    step = SimulatedBody._step
+    monkeypatch.setattr(SimulatedBody, "_step", lambda body: steps.append(arm.real_s) or step(body))
     monkeypatch.setattr(arm.node._publish, "state", lambda state: states.append((arm.real_s, state.mode)))
     arm.until(lambda: len(states) >= 6)
     assert np.diff([at_s for at_s, _ in states])[1:] == pytest.approx(0.5, abs=0.021)
+    assert len(steps) == len(states)
     arm.assign(replace(JOB, repetitions=20))
     began_s, before = arm.real_s, len(states)
     arm.until(lambda: len(states) >= before + 20)
     working_s = [at_s for at_s, mode in states[before:] if mode == "working"]
     assert working_s[0] - began_s < 0.25
     assert np.diff(working_s) == pytest.approx(0.05, abs=0.021)
+
+
+def test_a_job_of_an_idle_arm_begins_after_its_award(make):
+    """At 60 times real time, 0.4 s after the last step of an idle arm; the job takes 3 s to its place and 3 x 10 s."""
+    arm = make()
+    arm.until(lambda: len(arm.states) > 2)
+    arm.states.clear()
+    arm.until(lambda: arm.states)
+    arm._clock.passed_s += 0.4
+    arm.assign()
+    awarded_s = arm.node.clock.now_s(arm.real_s)
+    arm.until(lambda: arm.line.reports)
+    assert arm.line.reports[0].time_s >= awarded_s + 33.0 - SPEED / 20
 
 
 def test_a_dry_run_changes_nothing(make):
@@ -249,6 +268,25 @@ def test_a_stopped_arm_returns_its_job_as_sure(make):
     again = arm.ask(request())
     assert again.capacity == 0
     assert not arm.ask(award(again.quote, name="w2")).accepted
+
+
+def test_a_stopped_arm_at_home_leaves_once_it_has_quoted_that_it_takes_no_space(make):
+    """Otherwise its space would stay closed to the others until a person clears it."""
+    arm, quotes = make(), []
+
+    def serve(until_s):
+        arm._clock.passed_s = until_s
+        if until_s >= asked_s:
+            quotes.append(arm.ask(request(dry_run=True)))
+
+    arm.line.serve = serve
+    arm.assign()
+    arm._clock.passed_s += TURN_S
+    asked_s = arm.real_s + 2.0
+    arm.node.retire(arm.real_s + 60.0)
+    assert [report.outcome for report in arm.line.reports] == ["returned"]
+    assert [quote.space for quote in quotes] == [()]
+    assert arm.real_s == pytest.approx(asked_s, abs=IDLE_PERIOD_S)
 
 
 def test_a_faulted_arm_returns_its_job_with_the_cycles_and_a_person_clears_the_fault(make):
