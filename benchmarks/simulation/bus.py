@@ -14,10 +14,10 @@ from typing import Any
 import msgspec
 
 from benchmarks.simulation.world import Process, Sleep, World
-from fleet.bus.client import AnotherReplies, Replies, add_reply
+from fleet.bus.client import AnotherReplies, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.keys import channel_for
-from fleet.bus.protocol.messages import decode, encode, encoding
+from fleet.bus.protocol.messages import Refusal, decode, encode, encoding
 from fleet.errors import BusError, Refused
 
 ENCODED = 0.02
@@ -325,29 +325,24 @@ class _Query:
         """Reply, as the process of `client`."""
         own_key = keys.answered(expression, self.key) if expression.endswith("*") else expression
         try:
-            reply, refusal = handle(self.request), ""
+            reply = client._checked(handle(self.request))
         except Refused as refused:
-            reply, refusal = None, str(refused)
+            reply = Refusal(str(refused), refused.temporary)
         except AnotherReplies:
-            reply, refusal = None, ""
-        if reply is not None:
-            reply = client._checked(reply)
+            reply = None
         if client.world.reach(client.process, self.client.process):
-            client.world.send(
-                client.process, self.client.process, self.take, client.process.name, own_key, reply, refusal
-            )
+            client.world.send(client.process, self.client.process, self.take, client.process.name, own_key, reply)
 
-    def take(self, replier: str, key: str, reply: msgspec.Struct | None, refusal: str) -> None:
+    def take(self, replier: str, key: str, reply: msgspec.Struct | None) -> None:
         """Take a reply, as the querying process."""
         if self.over or replier in self.replied or not self.client.open_:
             return
         self.replied.add(replier)
         self.left -= 1
         if reply is not None:
-            add_reply(self.replies.messages, key, reply)
-            self.each(reply)
-        elif refusal:
-            self.replies.refused[key] = refusal
+            self.replies.add(key, reply)
+            if not isinstance(reply, Refusal):
+                self.each(reply)
         if not self.left:
             self._finish()
 

@@ -96,6 +96,14 @@ class Replies(Generic[Message]):
         """Reasons of the participants that refused, without those that did not reply in time."""
         return [reason for reason in self.refused.values() if reason]
 
+    def add(self, key: str, reply: Message | Refusal) -> None:
+        """Add what a participant replied under a key."""
+        if isinstance(reply, Refusal):
+            add_reply(self.refused, key, reply.reason)
+            self.temporary |= reply.temporary
+        else:
+            add_reply(self.messages, key, reply)
+
     def first(self, key: str) -> Message:
         """The first reply to a query of `key`.
 
@@ -617,11 +625,8 @@ class _PendingQuery(Generic[Reply]):
             add_reply(self._replies.refused, key, str(error))
             self._client.reject(f"reply under '{key}'", error)
             return
-        if isinstance(message, Refusal):
-            add_reply(self._replies.refused, key, message.reason)
-            self._replies.temporary |= message.temporary
-        else:
-            add_reply(self._replies.messages, key, message)
+        self._replies.add(key, message)
+        if not isinstance(message, Refusal):
             self._each(message)
 
     def _stop(self) -> None:

@@ -2,6 +2,7 @@
 
 import re
 from copy import deepcopy
+from functools import partial
 from typing import Any
 
 import pytest
@@ -23,6 +24,7 @@ from fleet.bus.protocol.auction import (
     Status,
     StatusRequest,
     Submission,
+    SubmissionReply,
 )
 from fleet.bus.protocol.consensus import History
 from fleet.bus.protocol.keys import HISTORY
@@ -407,7 +409,12 @@ def test_two_auctioneers_detect_each_other_and_neither_accept_nor_award_jobs(one
     with pytest.raises(Refused, match=re.escape(error)):
         boss(one).submit(Submission((job("b", 2),)))
     replies: list[Any] = []
-    one.world.processes[CLIENT].client.query(STATUS, StatusRequest(), Status, replies.append, timeout_s=2.0)
+    query = partial(one.world.processes[CLIENT].client.query, timeout_s=2.0)
+    query(keys.of_jobs("f", "submit"), Submission((job("b", 2),)), SubmissionReply, replies.append)
+    one.run(3.0)
+    both = replies.pop()
+    assert ([*both.refused.values()], both.temporary) == ([error, error], True)
+    query(STATUS, StatusRequest(), Status, replies.append)
     one.run(3.0)
     trouble = error.replace("accepted until", "accepted or awarded until")
     troubles = [(each.auctioneer, each.trouble, each.jobs[0].reason) for each in replies[0].messages.values()]
