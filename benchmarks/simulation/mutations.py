@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from msgspec.structs import replace as changed
 
-from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Operation, Pause, Resume, Settle
+from fleet.bus.protocol.operator import Cancel, Change, Operation, Pause, Resume, Settle
 from fleet.errors import Refused
 from fleet.live import steering as steering_module
 from fleet.live.arm.awards import ArmHistory, AwardAccepted, AwardExecutor, Closed
@@ -305,9 +305,9 @@ def _ignores(action: type) -> Callable[[Any], Any]:
 def _redone_at_once(objection: Any) -> Any:
     """Redo a job although its arm may still do its last cycle."""
 
-    def patched(book: Any, request: ControlRequest, arms: Any) -> str:
+    def patched(*arguments: Any) -> str:
         try:
-            return objection(book, request, arms)
+            return objection(*arguments)
         except Refused as refused:
             if "may still do the last cycle" in str(refused):
                 return ""

@@ -2,12 +2,12 @@
 
 import logging
 import math
-from collections.abc import Set
+from collections.abc import Mapping, Set
 
 from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import SETTLED, JobStatus
-from fleet.bus.protocol.messages import encode
+from fleet.bus.protocol.messages import State, encode
 from fleet.bus.protocol.operator import (
     ALL_ARMS,
     Cancel,
@@ -35,11 +35,14 @@ ALREADY_DONE = "This request was carried out before."
 NO_CHANGE = "Nothing changed: it is so already."
 
 
-def carry_out(book: JobBook, request: ControlRequest, arms: Set[str], time_s: float) -> tuple[Operation | None, str]:
+def carry_out(
+    book: JobBook, request: ControlRequest, arms: Set[str], states: Mapping[str, State], time_s: float
+) -> tuple[Operation | None, str]:
     """Carry out a request of a person, once; it is durable when this returns.
 
     Args:
         arms: Those that are present, and those of the cell.
+        states: Last states of the present arms.
 
     Returns:
         The operation, None if it was carried out before; and why nothing changes, "" if something does.
@@ -55,7 +58,7 @@ def carry_out(book: JobBook, request: ControlRequest, arms: Set[str], time_s: fl
                 "example a UUID."
             )
         return None, ALREADY_DONE
-    note = objection(book, request, arms)
+    note = objection(book, request, arms, states)
     operation = replace(operation_of(book, request, time_s), note=note)
     book.record(*progress(book, [requested_job(request)]), Requested(operation))
     _LOG.warning("'%s' requested: %s", request.by, encode(request.action).decode())
@@ -76,7 +79,7 @@ def operation_of(book: JobBook, request: ControlRequest, time_s: float) -> Opera
     return Operation(book.name, time_s, request, epoch=epoch, awards=awards)
 
 
-def objection(book: JobBook, request: ControlRequest, arms: Set[str]) -> str:
+def objection(book: JobBook, request: ControlRequest, arms: Set[str], states: Mapping[str, State]) -> str:
     """Return why a request changes nothing; "" if it changes something.
 
     Raises:
@@ -100,7 +103,7 @@ def objection(book: JobBook, request: ControlRequest, arms: Set[str]) -> str:
         case Clear():
             raise Refused("Space is freed by a request to jobs/clear, or by thermofleet arm clear.")
         case Cancel() | Settle() | Change() as action:
-            return _objection_to_job(book, action)
+            return _objection_to_job(book, action, states)
 
 
 def _check_arm(book: JobBook, arm: str, arms: Set[str]) -> None:
@@ -108,7 +111,7 @@ def _check_arm(book: JobBook, arm: str, arms: Set[str]) -> None:
         raise Refused(f"There is no arm '{arm}'. Arms: {listed(sorted(arms))}; '*' for all.")
 
 
-def _objection_to_job(book: JobBook, action: Cancel | Settle | Change) -> str:
+def _objection_to_job(book: JobBook, action: Cancel | Settle | Change, states: Mapping[str, State]) -> str:
     entry = book.jobs.get(action.job)
     if entry is None or (entry.spec is None and not entry.is_settled):
         if action.job in book.past:
@@ -127,8 +130,10 @@ def _objection_to_job(book: JobBook, action: Cancel | Settle | Change) -> str:
                 raise Refused(f"'{action.job}' is {state}; only an unfinished job can be settled.")
             if outcome == "redo" and book.ended:
                 raise Refused("The shift is over: nothing is redone.")
-            if outcome == "redo" and action.job in (at_work := book.at_work()):
-                arm = at_work[action.job][0]
+            at_work = [arm for arm, state in states.items() if state.job == action.job]  # also after it was cleared
+            at_work += [grant.record.arm for grant in book.open.values() if grant.record.job == action.job]
+            if outcome == "redo" and at_work:
+                arm = at_work[0]
                 raise Refused(
                     f"'{arm}' may still do the last cycle of '{action.job}'. Stop it and free its space "
                     f"(jobs/clear, or thermofleet arm clear {arm}) first."

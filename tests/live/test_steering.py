@@ -130,6 +130,19 @@ def test_an_unfinished_job_is_redone_only_after_its_arm_was_stopped_and_cleared(
     assert not fleet.control(Settle("a", "redo"), "redo").changed
 
 
+def test_a_job_is_not_redone_while_its_arm_is_online_with_it_after_its_space_was_cleared(fleet):
+    """Nobody stopped the process of the arm, which is still in the last cycle."""
+    fleet.submit(job("a", 1, dwell_s=300.0))
+    arm = lose_in_last_cycle(fleet)
+    fleet.free_space(arm)
+    fleet.cut()
+    fleet.run(4.0)
+    assert fleet.status("a").state == "unfinished"
+    assert f"'{arm}' may still do the last cycle" in refused(lambda: fleet.control(Settle("a", "redo")))
+    fleet.until(lambda: fleet.is_everywhere("a", "finished"))
+    assert fleet.finished == {"a": 1}
+
+
 def test_an_arm_that_is_paused_is_not_said_to_have_a_job(fleet):
     fleet.control(Pause("arm_1"))
     fleet.submit(job("a", **LONG), job("b", **LONG))

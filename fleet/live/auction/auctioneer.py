@@ -226,7 +226,9 @@ class Auctioneer:
 
     def control(self, request: ControlRequest, time_s: float) -> Controlled:
         """Carry out a request of a person, as `carry_out`."""
-        operation, note = carry_out(self.book, request, self.rounds.present.union(self.book.arms), time_s)
+        rounds = self.rounds
+        states = {arm: state for arm, state in rounds.states.items() if arm in rounds.present}
+        operation, note = carry_out(self.book, request, rounds.present.union(self.book.arms), states, time_s)
         if operation is not None:
             self.rounds.retry_now()
         job = requested_job(request)

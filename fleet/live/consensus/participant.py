@@ -194,7 +194,8 @@ class Participant:
         """
         job = requested_job(request)
         self.granter.add_jobs(each for each in later if each.name == job)
-        operation, note = carry_out(self.book, request, self.granter.roster, time_s)
+        states = {arm: state for arm, state in self.states.items() if arm in self._present}
+        operation, note = carry_out(self.book, request, self.granter.roster, states, time_s)
         if operation is not None:
             if (outcome := self.granter.known_outcome(job)) is not None:
                 self.claimant.send_outcome(outcome)
