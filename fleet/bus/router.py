@@ -21,7 +21,7 @@ from fleet.bus.protocol.keys import SESSION_LEASE_S
 from fleet.bus.protocol.messages import MOST_BYTES
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES
 from fleet.bus.security.access_control import ROSTER, Roster, RosterEntry, access_control, read_roster
-from fleet.bus.security.tls import Tls, identified, participant_at, server_name, why_not
+from fleet.bus.security.tls import Tls, identified, participant_at, try_connection
 from fleet.errors import BusError, NoRouter, StoppedWaiting
 
 _LOG = logging.getLogger(__name__)
@@ -219,9 +219,9 @@ def open_client(endpoint: str, *, timeout_s: float, tls: Tls | None = None) -> z
     try:
         return zenoh.open(_config({"mode": "client", "connect": connect}, link))
     except zenoh.ZError as error:
-        reason, stays = why_not(*_address(endpoint), tls)
-        sentence = f"No router answered at {endpoint} within {timeout_s} s ({reason or plain_reason(error)})."
-        raise (BusError if stays else NoRouter)(sentence) from error
+        trial = try_connection(*_address(endpoint), tls)
+        sentence = f"No router answered at {endpoint} within {timeout_s} s ({trial.reason or plain_reason(error)})."
+        raise (BusError if trial.stays else NoRouter)(sentence) from error
 
 
 class Router(Session):
@@ -332,13 +332,13 @@ class Router(Session):
         if {str(link.dst) for link in links} & _locators(host, port):
             return ""
         # The other router may have opened the link, or have several addresses: it is recognised by its certificate.
-        name = server_name(host, port, self._tls)
-        if name and name in {link.auth_identifier for link in links}:
+        linked, own = {link.auth_identifier for link in links}, RosterEntry(self._tls.name, "router").common_name
+        trial = try_connection(host, port, self._tls, {*linked, own})
+        if trial.server and trial.server in linked:
             return ""
-        if name == RosterEntry(self._tls.name, "router").common_name:
+        if trial.server == own:
             return "it is the address of this router, or of another one with the same certificate"
-        reason, _ = why_not(host, port, self._tls)
-        return reason or "it accepts the certificate, and the link is not open yet"
+        return trial.reason or "it accepts the certificate, and the link is not open yet"
 
     def _settings(self) -> zenoh.Config:
         roster = None

@@ -12,7 +12,7 @@ from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Clock, ClockRequest
 from fleet.bus.router import fleets_at, other_versions
-from fleet.bus.security.tls import identified, why_not
+from fleet.bus.security.tls import identified, try_connection
 from fleet.errors import BusError, visible
 from fleet.live.monitor.health import MOST_REASONS, ClockProbe, HealthReport, check_health
 from fleet.live.monitor.snapshot import FleetListener, FleetSnapshot
@@ -151,7 +151,7 @@ def why_unreachable(endpoint: str) -> str:
     host, port = match[1], int(match[2])
     try:
         with socket.create_connection((host, port), timeout=REPLY_S):
-            known, _ = why_not(host, port, None)  # the error names this reason already
+            known = try_connection(host, port, None).reason  # the error names this reason already
             return "" if known else f"Port {port} is open, but no thermofleet router listens on it."
     except ConnectionRefusedError:
         return f"Nothing listens at port {port} of {host}; start it with: thermofleet bus router --port {port}"

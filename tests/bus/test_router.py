@@ -311,7 +311,7 @@ def test_a_link_is_reported_when_it_opens_and_when_it_is_lost(place):
     far.close()
 
 
-def test_a_missing_link_has_its_reason(place, tmp_path):
+def test_a_missing_link_has_its_reason_from_one_trial(place, tmp_path, monkeypatch):
     make(tmp_path / "other", of_arms("f", ARMS), days=30)
     with Router() as plain, Router(tls=Tls(tmp_path / "other", "router")) as foreign, ExitStack() as stack:
         unknown, http = "tls/nowhere.invalid:7447", plain.endpoint.replace("tcp/", "tls/")
@@ -326,8 +326,10 @@ def test_a_missing_link_has_its_reason(place, tmp_path):
             "is not valid: .*another fleet",
             "address of this router",
         ]
+        tried, connect_to = [], socket.create_connection
+        monkeypatch.setattr(socket, "create_connection", lambda *at, **how: tried.append(at) or connect_to(*at, **how))
         sentences = router.link_changes()
-        assert len(sentences) == len(reasons)
+        assert len(tried) == len(sentences) == len(reasons)
         for endpoint, reason, sentence in zip(connect, reasons, sentences, strict=True):
             assert re.search(rf"No link to the router at {re.escape(endpoint)} \(.*({reason})", sentence), sentence
 

@@ -16,7 +16,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.router import Router, fleets_at, open_client
 from fleet.bus.security.access_control import RosterEntry, of_arms
 from fleet.bus.security.certificates import issue, make
-from fleet.bus.security.tls import Tls, why_not
+from fleet.bus.security.tls import Tls, try_connection
 from fleet.errors import BusError
 from tests.waiting import PATIENCE_S, wait_until
 
@@ -103,9 +103,9 @@ def test_plain_tcp_and_tls_do_not_meet(guarded, open_router, folder):
 
 def test_a_router_that_accepts_connections_and_is_suspended_is_not_taken_for_one_without_tls(folder):
     with socket.create_server(("127.0.0.1", 0)) as silent:
-        reason, stays = why_not("127.0.0.1", silent.getsockname()[1], Tls(folder, "arm_0"))
-    assert reason.startswith("no reply to the TLS handshake: the server is suspended")
-    assert not stays
+        trial = try_connection("127.0.0.1", silent.getsockname()[1], Tls(folder, "arm_0"))
+    assert trial.reason.startswith("no reply to the TLS handshake: the server is suspended")
+    assert not trial.stays
 
 
 def test_keys_of_another_fleet_open_no_line_and_the_reason_is_told(guarded, tmp_path):

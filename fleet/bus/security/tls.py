@@ -8,11 +8,12 @@ import logging
 import os
 import socket
 import ssl
+from collections.abc import Container
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 from urllib.parse import unquote
 
 from fleet.bus.security.access_control import ROLES, ROSTER, Role, RosterEntry, file_of, read_roster
@@ -184,31 +185,29 @@ def is_past(moment: datetime) -> bool:
 _NO_REPLY = "no reply to the TLS handshake: the server is suspended or overloaded, or does not use TLS"
 
 
-def why_not(host: str, port: int, tls: Tls | None) -> tuple[str, bool]:
-    """Why a connection to a router fails, from a trial handshake, and whether it will also fail later.
+class Trial(NamedTuple):
+    """Result of a trial handshake with a router."""
 
-    The reason is "" if the handshake gives none.
+    reason: str
+    """Why a connection fails; "" if the handshake gives no reason."""
+    stays: bool
+    """Whether it will also fail later."""
+    server: str = ""
+    """Common name in the certificate of the server, as `router:router_2`; "" if the handshake fails before."""
+
+
+def try_connection(host: str, port: int, tls: Tls | None, known: Container[str] = ()) -> Trial:
+    """Find out why a connection to a router fails.
+
+    Args:
+        known: Common names of servers; for one of these no reason is looked for.
     """
     try:
         with socket.create_connection((host, port), timeout=_PROBE_S) as line:
-            reason = _why_not_plain(line) if tls is None else _why_not_tls(line, host, tls)
+            reason, server = (_why_not_plain(line), "") if tls is None else _why_not_tls(line, host, tls, known)
     except OSError as error:
-        return error.strerror or str(error), False
-    return reason, reason not in ("", _NO_REPLY)
-
-
-def server_name(host: str, port: int, tls: Tls) -> str:
-    """Common name in the certificate of a server, as `router:router_2`; "" if a handshake with it fails."""
-    with (
-        suppress(OSError),
-        socket.create_connection((host, port), timeout=_PROBE_S) as line,
-        tls.context().wrap_socket(line, server_hostname=host) as secure,
-    ):
-        subject = (secure.getpeercert() or {}).get("subject", ())
-        for ((field, value),) in cast(tuple[tuple[tuple[str, str]], ...], subject):
-            if field == "commonName":
-                return value
-    return ""
+        return Trial(error.strerror or str(error), stays=False)
+    return Trial(reason, reason not in ("", _NO_REPLY), server)
 
 
 def _why_not_plain(line: socket.socket) -> str:
@@ -220,25 +219,32 @@ def _why_not_plain(line: socket.socket) -> str:
     return ""
 
 
-def _why_not_tls(line: socket.socket, host: str, tls: Tls) -> str:
-    accepted = False
+def _why_not_tls(line: socket.socket, host: str, tls: Tls, known: Container[str]) -> tuple[str, str]:
+    """Return why a connection fails, and the common name of the server."""
+    server, accepted = "", False
     try:
         with tls.context().wrap_socket(line, server_hostname=host) as secure:
-            accepted = True
-            # In TLS 1.3 the server checks our certificate after our half of the handshake; a read gets its error.
-            secure.recv(1)
+            server, accepted = _server_name(secure), True
+            if server not in known:
+                # In TLS 1.3 the server checks our certificate after our half of the handshake; a read gets its error.
+                secure.recv(1)
     except ssl.SSLCertVerificationError as error:
         hint = (
             f"; are the keys in '{tls.folder}' those of another fleet?"
             if error.verify_code in _UNKNOWN_AUTHORITY
             else ""
         )
-        return f"the server's certificate is not valid: {error.verify_message}{hint}"
+        return f"the server's certificate is not valid: {error.verify_message}{hint}", server
     except ssl.SSLError as error:
         reason = (error.reason or str(error)).lower().replace("_", " ")
         if "alert" in reason:
-            return f"the router refuses the certificate of '{tls.name}': {reason.partition('alert ')[2]}"
-        return f"the server does not use TLS: {reason}"
+            return f"the router refuses the certificate of '{tls.name}': {reason.partition('alert ')[2]}", server
+        return f"the server does not use TLS: {reason}", server
     except TimeoutError:
-        return "" if accepted else _NO_REPLY
-    return ""
+        return "" if accepted else _NO_REPLY, server
+    return "", server
+
+
+def _server_name(secure: ssl.SSLSocket) -> str:
+    subject = cast(tuple[tuple[tuple[str, str]], ...], (secure.getpeercert() or {}).get("subject", ()))
+    return next((value for ((field, value),) in subject if field == "commonName"), "")
