@@ -7,12 +7,13 @@ have no effect. A table numbers the volumes of a cell.
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -35,6 +36,24 @@ SPACE_VERSION = 1
 FARTHEST_M = 1.5
 """Upper bound of the distance from the base to any part of an arm and its payload: 0.29 m to joint 2, 0.91 m to the
 flange, a payload of 0.2 m, and the radius of a link."""
+
+
+class Sphere(NamedTuple):
+    """A sphere in the frame of the cell, m."""
+
+    x: float
+    y: float
+    z: float
+    radius: float
+
+    def gap_m(self, other: "Sphere") -> float:
+        """Distance to another sphere, negative if they overlap."""
+        return math.dist(self[:3], other[:3]) - self.radius - other.radius
+
+
+def workspace(robot: Robot) -> Sphere:
+    """Sphere that contains all that an arm can reach."""
+    return Sphere(*robot.mount.position_m, FARTHEST_M)
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,8 +238,7 @@ def _geometry(robot: Robot) -> dict[str, object]:
 
 
 def _in_reach(one: Robot, other: Robot, margin_m: float) -> bool:
-    apart_m = np.linalg.norm(np.subtract(one.mount.position_m, other.mount.position_m))
-    return bool(apart_m < 2 * FARTHEST_M + margin_m)
+    return workspace(one).gap_m(workspace(other)) < margin_m
 
 
 def _comparison(one: _Paths, other: _Paths, margin_m: float) -> Callable[[], dict[str, Array]]:

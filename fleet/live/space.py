@@ -6,13 +6,13 @@ computes from the plan (`fleet.arm.space.space_name`). `sphere:X,Y,Z,R` is a sph
 an arm that the scenario does not know. Any other name stands for the whole workspace of the arm.
 """
 
-import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
+
+from fleet.arm.space import Sphere
 
 ANYWHERE = "*"
 """Space of an arm at an unknown position: its whole workspace."""
@@ -23,19 +23,6 @@ Symmetric."""
 
 MOST_M = 1000.0
 """Largest coordinate and radius of a sphere."""
-
-
-class Sphere(NamedTuple):
-    """A sphere in the frame of the cell, m."""
-
-    x: float
-    y: float
-    z: float
-    radius: float
-
-    def gap_m(self, other: "Sphere") -> float:
-        """Distance to another sphere, negative if they overlap."""
-        return math.dist(self[:3], other[:3]) - self.radius - other.radius
 
 
 @lru_cache(maxsize=4096)

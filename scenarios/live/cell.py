@@ -5,13 +5,13 @@ from typing import Any  # plain values of JSON
 
 from msgspec.structs import replace
 
-from fleet.arm.space import FARTHEST_M, space_name
+from fleet.arm.space import space_name, workspace
 from fleet.bus.protocol.auction import MOST_JOBS
 from fleet.bus.protocol.cell import Cell, CellArm, CellFixture, CellKind, CellPlace, Limit, PlannedWork, Point
 from fleet.bus.protocol.messages import encode
 from fleet.files import cache_folder
 from fleet.job import BOUNDS, Fixture, Place, Work
-from fleet.live.space import CellSpace, Sphere
+from fleet.live.space import CellSpace
 from fleet.motion import Plan
 from fleet.robot import RATING, Mount, Robot
 from scenarios.progress import Progress, quiet
@@ -60,7 +60,7 @@ def cell_of(scenario: Scenario, participant: str, progress: Progress = quiet) ->
     space = CellSpace(
         volume={space_name(key): volume for key, volume in table.volume.items()},
         conflicts=table.conflicts,
-        workspaces={robot.name: Sphere(*robot.mount.position_m, FARTHEST_M) for robot in robots},
+        workspaces={robot.name: workspace(robot) for robot in robots},
         clearance_m=scenario.clearance_m,
     )
     return cell, space

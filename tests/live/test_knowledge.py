@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fleet.arm.space import plan_key, space_name
+from fleet.arm.space import Sphere, plan_key, space_name
 from fleet.bus.protocol.auction import Award, QuoteRequest, Submission
 from fleet.bus.protocol.consensus import Bid
 from fleet.bus.protocol.messages import State
@@ -29,7 +29,7 @@ from fleet.live.consensus.grants import Granter
 from fleet.live.consensus.participant import QUIET_S, Membership, Participant
 from fleet.live.leases import Timing
 from fleet.live.records import SendAward
-from fleet.live.space import CellSpace, Sphere
+from fleet.live.space import CellSpace
 from fleet.observation import FIELDS, Observation
 from fleet.robot import JOINTS, ThermalLimits
 from scenarios.live.auctioneer import CentralAllocation, job_spec

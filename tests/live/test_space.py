@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleet.arm.space import space_name
+from fleet.arm.space import Sphere, space_name
 from fleet.job import Place, Work
-from fleet.live.space import ANYWHERE, CellSpace, Sphere, arms_in_the_way
+from fleet.live.space import ANYWHERE, CellSpace, arms_in_the_way
 
 WORK = Work(kind="hold", places=(Place(name="bench", position_m=(0.5, 0.0, 0.2)),), payload_kg=2.0)
 CELL = CellSpace(
