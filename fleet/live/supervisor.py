@@ -32,6 +32,8 @@ WAITS = 75
 NOTICES, NOTICE_S = ("Waiting for a router.", "The certificate of '"), 60.0
 """Starts of log messages of a process that are also logged here: it is cut off, or its certificate expires soon, has
 expired or was renewed. Real seconds before one is repeated."""
+ENDS = "' ends on "
+"""Part of the reminder that a certificate expires soon."""
 LOG_S = 1.0
 """Real seconds to wait for the last output of an exited process."""
 
@@ -299,9 +301,11 @@ class Supervisor:
 
     def _notice(self, name: str, line: str) -> None:
         message, now_s = line.partition(": ")[2].strip(), time.monotonic()
-        if message.startswith(NOTICES) and now_s >= self._noticed_s.get(message, -NOTICE_S) + NOTICE_S:
-            self._noticed_s[message] = now_s
-            _LOG.warning("'%s': %s", name, message)
+        # Certificates that were made together end together: the reminder of one process stands for all.
+        kind, more = (ENDS, " See the logs of the other processes, too.") if ENDS in message else (message, "")
+        if message.startswith(NOTICES) and now_s >= self._noticed_s.get(kind, -NOTICE_S) + NOTICE_S:
+            self._noticed_s[kind] = now_s
+            _LOG.warning("'%s': %s%s", name, message, more)
 
     def _await_exit(self, running: _Running, process: "subprocess.Popen[str]") -> None:
         """Note the exit of a process, also if one that it has started still holds its output open."""

@@ -145,6 +145,16 @@ def test_a_process_that_is_cut_off_is_reported_once(tmp_path, caplog):
     assert messages == [f"'arm-a': {line.partition(': ')[2]}" for line in (waiting, expired)]
 
 
+def test_certificates_that_end_soon_are_reported_once_for_all_processes(tmp_path, caplog):
+    reminder = "The certificate of 'arm:{}' ends on 2026-12-05 07:28 UTC; thermofleet bus keys --add renews it."
+    with Supervisor(tmp_path) as supervisor:
+        for name in ("a", "b"):
+            line = f"WARNING  fleet.bus.security.tls: {reminder.format(name)}"
+            supervisor.start(part(f"arm-{name}", f"print({line!r}); {WAIT}"), ready_s=PATIENCE_S)
+    messages = [record.getMessage() for record in caplog.records]
+    assert messages == [f"'arm-a': {reminder.format('a')} See the logs of the other processes, too."]
+
+
 def test_the_fleet_ends_when_an_essential_process_exits_with_code_0(tmp_path):
     with Supervisor(tmp_path) as supervisor:
         supervisor.start(part("stays", WAIT), ready_s=PATIENCE_S)
