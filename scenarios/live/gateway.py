@@ -47,7 +47,7 @@ from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobSpec, QuoteRequest, StatusRequest, Submission, SubmissionReply
 from fleet.bus.protocol.cell import Cell, CellRequest
-from fleet.bus.protocol.messages import MalformedMessage, decode, encode
+from fleet.bus.protocol.messages import MalformedMessage, PersonRequest, decode, encode
 from fleet.bus.protocol.operator import (
     Alarm,
     Cleared,
@@ -189,7 +189,7 @@ def _model_of(cell: Cell) -> Mapping[str, Any]:
     return {**described_model(cell, [arm.name for arm in cell.arms]), "heat": heat_scale(cell.warning_c, cell.error_c)}
 
 
-Body = TypeVar("Body", bound=msgspec.Struct)
+Body = TypeVar("Body", bound=PersonRequest)
 Asked = TypeVar("Asked", bound=msgspec.Struct)
 Reply = TypeVar("Reply")
 Endpoint = Callable[[Request], Awaitable[Response]]
@@ -320,13 +320,13 @@ def problem_response(status: HTTPStatus, detail: str, headers: Mapping[str, str]
     return Response(msgspec.json.encode(fields), status.value, headers, media_type="application/problem+json")
 
 
-class AskBody(msgspec.Struct, frozen=True):
+class AskBody(PersonRequest, frozen=True):
     """Body of /v4/ask: jobs for quotes."""
 
     jobs: tuple[JobSpec, ...]
 
 
-class AcknowledgeBody(msgspec.Struct, frozen=True):
+class AcknowledgeBody(PersonRequest, frozen=True):
     """Body of /v4/alarms: a person has seen an alarm."""
 
     alarm: str
@@ -334,7 +334,7 @@ class AcknowledgeBody(msgspec.Struct, frozen=True):
     """Who has seen it."""
 
 
-class ResetBody(msgspec.Struct, frozen=True):
+class ResetBody(PersonRequest, frozen=True):
     """Body of /v4/reset: clear the fault of an arm."""
 
     arm: str

@@ -25,6 +25,7 @@ from fleet.bus.protocol.auction import (
     QuoteRequest,
 )
 from fleet.bus.protocol.cell import Cell, CellRequest
+from fleet.bus.protocol.messages import unknown_field
 from fleet.bus.protocol.operator import (
     ALL_ARMS,
     Action,
@@ -198,7 +199,10 @@ def read_jobs(file: str, begin: str = "") -> dict[int, JobSpec]:
 
 def _decode(raw: bytes, kind: type[Decoded], where: str) -> Decoded:
     try:
-        return msgspec.json.decode(raw, type=kind)
+        decoded = msgspec.json.decode(raw, type=kind)
+        if unknown := unknown_field(kind, raw):
+            raise FleetError(f"{where}: {unknown}")
+        return decoded
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise FleetError(f"{where}: {explain(error)}") from error
 

@@ -35,7 +35,7 @@ BROWSER = {"Accept": "text/html,application/xhtml+xml,application/xml;q=0.9,*/*;
 CRATE_JSON = {"name": "crate 1", "kind": "hold", "places": ["rack"]}
 JSON = "application/json"
 PAUSE = {"request": "1", "action": {"action": "pause"}}
-FLY, LATE = {"action": "fly"}, {"action": "change", "job": "a", "due_s": -5}
+ARMS, FLY, LATE = {"action": "resume", "arms": "a"}, {"action": "fly"}, {"action": "change", "job": "a", "due_s": -5}
 SETTLE = {"action": "settle", "job": "a", "outcome": "so"}
 CSV = {"Content-Type": "text/csv; charset=utf-8"}
 WATCHER, SENDER, BOSS = "watcher-watcher-watcher", "sender-sender-sender", "operator-operator-operator"
@@ -235,7 +235,7 @@ PROBLEMS = [
     (405, "DELETE /v4/jobs", "Not Allowed"),
     (421, "GET /v4/fleet", "evil.example", None, {"Host": "evil.example"}),
     (421, "GET /page/cell.js", "evil.example", None, {"Host": "evil.example:80"}),
-    (422, "POST /v4/control", "`. Allowed: cancel, change, clear, pause, resume, settle", {**PAUSE, "action": FLY}),
+    (422, "POST /v4/control", "`. Allowed: cancel, change, pause, resume, settle", {**PAUSE, "action": FLY}),
     (422, "POST /v4/control", "`. Allowed: done, redo", {**PAUSE, "action": SETTLE}),
     (422, "POST /v4/jobs", "Submission.by must have 1 to 128 printable", {"jobs": [CRATE_JSON], "by": "a\nb"}),
     (422, "POST /v4/jobs?by=%1b", "Submission.by must have 1 to 128", b"name,kind,places\na,hold,pallet", CSV),
@@ -244,6 +244,10 @@ PROBLEMS = [
     (422, "POST /v4/reset", "ResetBody.by must have 1 to 128 printable", {"arm": "a+1", "by": "\r"}),
     (422, "POST /v4/alarms", "AcknowledgeBody.by must have 1 to 128 printable", {"alarm": "a", "by": "\r"}),
     (422, "POST /v4/control", "Change.due_s must be between 0 and", {**PAUSE, "action": LATE}),
+    (422, "POST /v4/control", "Unknown field 'arms' in action; did you mean 'arm'?", {**PAUSE, "action": ARMS}),
+    (422, "POST /v4/ask", "Unknown field 'payloadkg' in jobs[0]", {"jobs": [{**CRATE_JSON, "payloadkg": 1}]}),
+    (422, "POST /v4/reset", "Unknown field 'name'. Allowed: arm, by.", {"arm": "a+1", "name": ""}),
+    (422, "POST /v4/alarms", "Unknown field 'who'. Allowed: alarm, by.", {"alarm": "a", "by": "b", "who": "c"}),
     (422, "POST /v4/alarms", "An object has the field 'by' twice.", '{"alarm": "a", "by": "b", "by": "c"}'),
     (422, "POST /v4/alarms", "Not", b'{"alarm": "a", "by": "b", "x": "\xff"}'),
     (422, "POST /v4/jobs?by=erp", "Parameters are for a table (text/csv);", {"jobs": [CRATE_JSON]}),
