@@ -84,7 +84,8 @@ class State(FiniteStruct, frozen=True, omit_defaults=True):
     space: str = ""
     """Name of the space that the arm takes while it is away from home; "" at home, or if not reported."""
     busy_s: Duration = 0.0
-    """Time until it is home with its current job done."""
+    """Time until it is home with its current job done; 0 for unknown while it has a job, whose status then has no
+    `finish_s`."""
     housing_c: tuple[Celsius, ...] = ()
     """Estimated housing temperatures, which have no sensor, [joint]."""
     ambient_c: Celsius | None = None
