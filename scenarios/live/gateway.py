@@ -544,9 +544,11 @@ class EventStream(StreamingResponse):
 
     async def _text(self) -> AsyncIterator[str]:
         last_boot, _, number = self._last_event.partition("-")
-        seen = int(number) if last_boot == self._boot and number.isdecimal() and len(number) < 20 else 0
+        is_of_this_start = last_boot == self._boot and number.isdecimal() and len(number) < 20
+        seen = int(number) if is_of_this_start else 0
         entries, gap = self._feed.since(seen)
-        gap_text = "event: gap\ndata: {}\n\n" if gap and self._last_event else ""
+        has_missed = self._last_event and (gap or not is_of_this_start)
+        gap_text = "event: gap\ndata: {}\n\n" if has_missed else ""
         yield "retry: 1000\n\n" + gap_text + "".join(map(self._event, entries))
         seen = entries[-1].number if entries else seen
         while not self._readers.closed:
