@@ -43,7 +43,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from fleet.bus.client import BusClient
+from fleet.bus.client import BusClient, NoReply
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobSpec, QuoteRequest, StatusRequest, Submission, SubmissionReply
 from fleet.bus.protocol.cell import Cell, CellRequest
@@ -58,6 +58,7 @@ from fleet.bus.protocol.operator import (
     ResetReply,
     ResetRequest,
     check_request,
+    without_reset,
 )
 from fleet.bus.security.access_control import RosterEntry, rights_by_role
 from fleet.bus.security.tls import participant_at
@@ -449,10 +450,16 @@ def application(
         body = await read_body(request, ResetBody)
         if not is_name(body.arm):
             raise HTTPException(HTTPStatus.UNPROCESSABLE_ENTITY, f"The name of an arm must have {NAME_RULE}.")
-        if body.arm not in (known := [arm.arm for arm in (await bridge.snapshot(0)).arms]):
-            raise HTTPException(HTTPStatus.NOT_FOUND, f"There is no arm '{body.arm}'. Arms: {listed(known)}.")
+        is_present = {arm.arm: arm.present for arm in (await bridge.snapshot(0)).arms}
+        if body.arm not in is_present:
+            raise HTTPException(HTTPStatus.NOT_FOUND, f"There is no arm '{body.arm}'. Arms: {listed(is_present)}.")
         key = keys.of_arm(bridge.fleet, body.arm, "reset")
-        return json_response(await ask(key, ResetRequest(body.by), ResetReply))
+        try:
+            return json_response(await ask(key, ResetRequest(body.by), ResetReply))
+        except NoReply as error:
+            if is_present[body.arm] and not error.late:
+                raise Refused(without_reset(body.arm)) from error
+            raise
 
     async def metrics(request: Request) -> Response:
         fleet = await bridge.snapshot()

@@ -38,6 +38,7 @@ from fleet.bus.protocol.operator import (
     ResetReply,
     ResetRequest,
     Resume,
+    without_reset,
 )
 from fleet.bus.security.tls import unknown_certificate_hint
 from fleet.errors import JOB_RULE, BusError, FleetError, Refused, is_name, nearest, printable, visible
@@ -336,6 +337,8 @@ def reset_arm(arm: str, by: str, endpoint: str, fleet: str) -> None:
         try:
             reply = link.ask(key, ResetRequest(_person(by)), ResetReply, timeout_s=REPLY_S)
         except NoReply as error:
+            if not error.late and link.tokens(keys.of_arm(link.fleet, arm, "alive")):
+                raise Refused(without_reset(arm)) from error
             raise BusError(f"The arm '{arm}' did not reply. {_NEEDS_ROLE}") from error
     echo(f"{arm}: its fault is cleared." if reply.changed else f"{arm}: it has no fault.")
 

@@ -162,6 +162,11 @@ class ResetRequest(PersonRequest, frozen=True):
     """Who requests it, for journal and event."""
 
 
+def without_reset(arm: str) -> str:
+    """Return why an online arm does not reply to a `ResetRequest`."""
+    return f"The arm '{arm}' is online and offers no reset: its fault must be cleared at the arm."
+
+
 class ResetReply(msgspec.Struct, frozen=True):
     """Reply to a `ResetRequest`."""
 

@@ -17,13 +17,16 @@ from pathlib import Path
 import pytest
 
 from fleet.bus.client import BusClient
+from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Admission, Status, SubmissionReply
+from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import ControlRequest, Operation, Pause, ResetRequest, Resume
 from fleet.bus.router import Router
-from fleet.errors import RefusedForNow
+from fleet.errors import Refused, RefusedForNow
 from fleet.live.monitor.snapshot import FleetView
 from scenarios.live.fleet_processes import page_of
 from scenarios.live.gateway import FILES, MAX_BYTES, MAX_TABLE_BYTES, LivePage, scene_of
+from scenarios.live.requests import reset_arm
 from scenarios.spec.load import load
 from tests import commands
 from tests.live.gateway.moving_fleet import MovingFleet
@@ -149,6 +152,25 @@ def test_a_fault_is_reset_over_http(gateway, arm):
     assert status == 404
     assert reply["detail"].startswith("There is no arm 'nobody'. Arms: a+1")
     assert gateway.ask(*token, {"arm": "a/b"})[0] == 422
+
+
+def test_an_online_arm_that_offers_no_reset_is_not_called_offline():
+    with Router() as own_router, Served(own_router.endpoint) as gateway, BusClient(own_router.endpoint, "f") as own:
+        own.declare_token(keys.of_arm("f", "own", "alive"))
+        tell = own.publisher(keys.of_arm("f", "own", "state"), State)
+
+        def is_present():
+            tell(State("own", 1, 1.0, "faulted", (40.0,), 20.0))
+            return any(arm["arm"] == "own" and arm["present"] for arm in gateway.ask("GET", "/v4/fleet")[2]["arms"])
+
+        wait_until(is_present)
+        status, _, reply = gateway.ask("POST", "/v4/reset", {"arm": "own"})
+        with pytest.raises(Refused, match="'own' is online and offers no reset"):
+            reset_arm("own", "ann", own_router.endpoint, "f")
+    assert (status, reply["detail"]) == (
+        409,
+        "The arm 'own' is online and offers no reset: its fault must be cleared at the arm.",
+    )
 
 
 def test_the_snapshot_names_the_paused_arms_and_as_many_jobs_as_asked_for(gateway, arm):
