@@ -280,7 +280,8 @@ class AccessCheck:
         shown = headers.get(b"authorization", b"")
         if shown[:7].lower() == b"bearer " and any([hmac.compare_digest(shown[7:], token) for token in self.tokens]):
             return None
-        detail = "This gateway needs a token: Authorization: Bearer …."
+        needed = "This gateway needs a token: Authorization: Bearer …."
+        detail = "This token is not valid." if shown[:7].lower() == b"bearer " else needed
         return problem_response(HTTPStatus.UNAUTHORIZED, detail, {"WWW-Authenticate": "Bearer"})
 
     def _too_fast(self, sender: bytes) -> Response | None:

@@ -91,8 +91,10 @@ def test_without_the_page_the_gateway_serves_no_html(router, arm):
 
 def test_the_page_needs_no_token_and_everything_about_the_fleet_does(guarded):
     for wrong in ("Bearer wrong", f"Basic {BOSS}", f"Bearer {BOSS}x", f"Bearer {BOSS[:-1]}"):
-        status, kind, _ = guarded.ask("GET", "/v4/fleet", headers={"Authorization": wrong})
+        status, kind, reply = guarded.ask("GET", "/v4/fleet", headers={"Authorization": wrong})
         assert (status, kind) == (401, "application/problem+json"), wrong
+        says = "This gateway needs a token" if wrong.startswith("Basic") else "This token is not valid."
+        assert reply["detail"].startswith(says)
     assert guarded.ask("GET", "/v4/fleet", headers={"Authorization": f"bearer {BOSS}", "Host": "any"})[0] == 200
     assert get(guarded, "/", BROWSER)[0] == 200
     assert get(guarded, "/page/dashboard.js")[0] == 200
