@@ -60,6 +60,7 @@ from fleet.bus.protocol.operator import (
     check_request,
     without_reset,
 )
+from fleet.bus.router import fleets_at
 from fleet.bus.security.access_control import RosterEntry, rights_by_role
 from fleet.bus.security.tls import participant_at
 from fleet.env.render.heat import heat_scale
@@ -724,6 +725,9 @@ def run_gateway(
         with until_stopped() as stop:
             link = BusClient(endpoint, name, stopped=stop.is_set).open()
         with link:
+            if name not in (fleets := fleets_at(endpoint)):
+                there = f"Fleets at {endpoint}: {listed(fleets)}."
+                _LOG.warning("No participant of the fleet '%s' is online yet. %s", name, there)
             number = asyncio.run(serve(link, bound, roles, page, kept=kept, hooks=hooks))
     if number == signal.SIGINT:
         raise Interrupted("The gateway was interrupted.")

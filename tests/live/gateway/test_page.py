@@ -567,6 +567,13 @@ def test_the_command_exits_on_a_signal_even_while_a_reader_is_connected(router, 
         assert "Traceback" not in started.stderr.read()
 
 
+def test_a_gateway_of_a_fleet_without_participants_names_those_that_have_some(router, arm):
+    with process(router, "--fleet", "nofleet") as (started, _):
+        started.terminate()
+        said = started.communicate(timeout=PATIENCE_S)[1]
+    assert f"No participant of the fleet 'nofleet' is online yet. Fleets at {router}: f." in said
+
+
 @pytest.mark.ci_slow
 def test_the_command_waits_for_a_router():
     with socket.socket() as free:
