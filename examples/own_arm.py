@@ -285,6 +285,7 @@ class Arm:
     def publish_state(self):
         """Publish telemetry; older messages may be dropped."""
         self.tick += 1
+        cycles = self.job["repetitions"] - self.job["cycles"] if self.job else 0
         state = {
             "arm": self.name,
             "tick": self.tick,
@@ -293,6 +294,7 @@ class Arm:
             "temp_c": [self.temp_c],
             "headroom_k": LIMIT_C - self.temp_c,
             "job": self.job["job"] if self.job else "",
+            "busy_s": self.speed * CYCLE_S * cycles,  # in fleet time; `jobs/status` gets its `finish_s` from it
             "leaving": self.leaving,
         }
         self.session.put(

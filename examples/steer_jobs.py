@@ -20,15 +20,19 @@ from urllib.parse import quote
 from submit_jobs import connect, query, submit, wait_for_results
 
 ATTEMPTS = 3
-"""Attempts for each request; a repeated request is carried out once, because its name is unique."""
+"""Attempts for each request, without a reply or with a temporary refusal; a repeated one is carried out once, because
+its name is unique."""
 
 
 def control(session, root, action):
     """Request an action; return the reply, None if it is refused or without a reply."""
     request = {"request": uuid.uuid4().hex, "action": action, "by": "steer_jobs.py"}
+    refusals = []
     for _ in range(ATTEMPTS):
-        for reply in query(session, f"{root}/jobs/control", "ControlRequest", request):
+        for reply in query(session, f"{root}/jobs/control", "ControlRequest", request, refusals.append):
             return reply
+        if not all(refusal.get("temporary") for refusal in refusals):
+            break
     return None
 
 
@@ -63,7 +67,8 @@ def main(port, fleet, verb, *words):
         if reply is None:
             return False
         job = reply.get("job") or {}
-        print(verb, json.dumps({name: job[name] for name in ("job", "state", "cycles", "repetitions") if name in job}))
+        shown = {name: job[name] for name in ("job", "state", "cycles", "repetitions") if name in job}
+        print(verb, json.dumps(shown or {"paused": reply.get("paused", {})}))  # who paused each arm, "*" for all
         print("changed" if reply["changed"] else "not changed", reply.get("note", ""))
         return True
 

@@ -75,7 +75,7 @@ def wait_for_results(session, root, names, seconds):
     return final
 
 
-def query(session, key, name, request):
+def query(session, key, name, request, on_refusal=lambda refusal: None):
     """Return all replies to a request; print refusals and timeouts."""
     replies = session.get(
         key,
@@ -90,7 +90,9 @@ def query(session, key, name, request):
         if reply.ok is None:  # from Zenoh itself: no reply in time
             print(f"no reply: {reply.err.payload.to_bytes().decode()}", flush=True)
         elif str(reply.ok.encoding) == "application/json;thermofleet.Refusal.v4":
-            print(f"refused: {json.loads(reply.ok.payload.to_bytes())['reason']}", flush=True)
+            refusal = json.loads(reply.ok.payload.to_bytes())
+            print(f"refused: {refusal['reason']}", flush=True)
+            on_refusal(refusal)
         else:
             messages.append(json.loads(reply.ok.payload.to_bytes()))
     return messages

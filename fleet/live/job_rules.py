@@ -345,7 +345,7 @@ def waits_since_s(status: JobStatus) -> float | None:
 def finish_s(status: JobStatus, state: State | None) -> float | None:
     """Return the expected fleet time at which a job is finished, by the last state of its arm; None for unknown."""
     at_work = status.state in ("awarded", "finishing") and state is not None and state.job == status.job
-    return state.time_s + state.busy_s if at_work and state is not None else None
+    return state.time_s + state.busy_s if at_work and state is not None and state.busy_s else None
 
 
 def urgency(state: JobState, *, shift_ended: bool) -> int:

@@ -234,6 +234,9 @@ class Follower:
         topics: Topics of its joint states, and of the diagnostics with its motor temperatures.
         clock: Fleet time, at a speed of 1.
         monitor: Gets the readings of every state with positions, velocities and torques.
+
+    Raises:
+        BusError: the speed of the fleet is not 1; before it publishes anything.
     """
 
     def __init__(
@@ -249,7 +252,8 @@ class Follower:
         rate_hz: float = 10.0,
         monitor: MotionMonitor | None = None,
     ) -> None:
-        self._link, self._arm, self._readings, self._clock = link, arm, readings, clock
+        self._link, self._arm, self._readings = link, arm, readings
+        self._set_clock(clock, jump=True)
         self._warning_c = (limits or ThermalLimits()).warning_c
         self._period_s, self._tick, self._due_s = 1.0 / rate_hz, 0, time.monotonic()
         self._monitor = monitor

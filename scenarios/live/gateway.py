@@ -43,11 +43,11 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from fleet.bus.client import BusClient
+from fleet.bus.client import BusClient, NoReply
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobSpec, QuoteRequest, StatusRequest, Submission, SubmissionReply
 from fleet.bus.protocol.cell import Cell, CellRequest
-from fleet.bus.protocol.messages import MalformedMessage, decode, encode
+from fleet.bus.protocol.messages import MalformedMessage, PersonRequest, decode, encode
 from fleet.bus.protocol.operator import (
     Alarm,
     Cleared,
@@ -58,7 +58,9 @@ from fleet.bus.protocol.operator import (
     ResetReply,
     ResetRequest,
     check_request,
+    without_reset,
 )
+from fleet.bus.router import fleets_at
 from fleet.bus.security.access_control import RosterEntry, rights_by_role
 from fleet.bus.security.tls import participant_at
 from fleet.env.render.heat import heat_scale
@@ -189,7 +191,7 @@ def _model_of(cell: Cell) -> Mapping[str, Any]:
     return {**described_model(cell, [arm.name for arm in cell.arms]), "heat": heat_scale(cell.warning_c, cell.error_c)}
 
 
-Body = TypeVar("Body", bound=msgspec.Struct)
+Body = TypeVar("Body", bound=PersonRequest)
 Asked = TypeVar("Asked", bound=msgspec.Struct)
 Reply = TypeVar("Reply")
 Endpoint = Callable[[Request], Awaitable[Response]]
@@ -279,7 +281,8 @@ class AccessCheck:
         shown = headers.get(b"authorization", b"")
         if shown[:7].lower() == b"bearer " and any([hmac.compare_digest(shown[7:], token) for token in self.tokens]):
             return None
-        detail = "This gateway needs a token: Authorization: Bearer …."
+        needed = "This gateway needs a token: Authorization: Bearer …."
+        detail = "This token is not valid." if shown[:7].lower() == b"bearer " else needed
         return problem_response(HTTPStatus.UNAUTHORIZED, detail, {"WWW-Authenticate": "Bearer"})
 
     def _too_fast(self, sender: bytes) -> Response | None:
@@ -320,13 +323,13 @@ def problem_response(status: HTTPStatus, detail: str, headers: Mapping[str, str]
     return Response(msgspec.json.encode(fields), status.value, headers, media_type="application/problem+json")
 
 
-class AskBody(msgspec.Struct, frozen=True):
+class AskBody(PersonRequest, frozen=True):
     """Body of /v4/ask: jobs for quotes."""
 
     jobs: tuple[JobSpec, ...]
 
 
-class AcknowledgeBody(msgspec.Struct, frozen=True):
+class AcknowledgeBody(PersonRequest, frozen=True):
     """Body of /v4/alarms: a person has seen an alarm."""
 
     alarm: str
@@ -334,7 +337,7 @@ class AcknowledgeBody(msgspec.Struct, frozen=True):
     """Who has seen it."""
 
 
-class ResetBody(msgspec.Struct, frozen=True):
+class ResetBody(PersonRequest, frozen=True):
     """Body of /v4/reset: clear the fault of an arm."""
 
     arm: str
@@ -449,10 +452,16 @@ def application(
         body = await read_body(request, ResetBody)
         if not is_name(body.arm):
             raise HTTPException(HTTPStatus.UNPROCESSABLE_ENTITY, f"The name of an arm must have {NAME_RULE}.")
-        if body.arm not in (known := [arm.arm for arm in (await bridge.snapshot(0)).arms]):
-            raise HTTPException(HTTPStatus.NOT_FOUND, f"There is no arm '{body.arm}'. Arms: {listed(known)}.")
+        is_present = {arm.arm: arm.present for arm in (await bridge.snapshot(0)).arms}
+        if body.arm not in is_present:
+            raise HTTPException(HTTPStatus.NOT_FOUND, f"There is no arm '{body.arm}'. Arms: {listed(is_present)}.")
         key = keys.of_arm(bridge.fleet, body.arm, "reset")
-        return json_response(await ask(key, ResetRequest(body.by), ResetReply))
+        try:
+            return json_response(await ask(key, ResetRequest(body.by), ResetReply))
+        except NoReply as error:
+            if is_present[body.arm] and not error.late:
+                raise Refused(without_reset(body.arm)) from error
+            raise
 
     async def metrics(request: Request) -> Response:
         fleet = await bridge.snapshot()
@@ -544,9 +553,11 @@ class EventStream(StreamingResponse):
 
     async def _text(self) -> AsyncIterator[str]:
         last_boot, _, number = self._last_event.partition("-")
-        seen = int(number) if last_boot == self._boot and number.isdecimal() and len(number) < 20 else 0
+        is_of_this_start = last_boot == self._boot and number.isdecimal() and len(number) < 20
+        seen = int(number) if is_of_this_start else 0
         entries, gap = self._feed.since(seen)
-        gap_text = "event: gap\ndata: {}\n\n" if gap and self._last_event else ""
+        has_missed = self._last_event and (gap or not is_of_this_start)
+        gap_text = "event: gap\ndata: {}\n\n" if has_missed else ""
         yield "retry: 1000\n\n" + gap_text + "".join(map(self._event, entries))
         seen = entries[-1].number if entries else seen
         while not self._readers.closed:
@@ -714,9 +725,22 @@ def run_gateway(
         with until_stopped() as stop:
             link = BusClient(endpoint, name, stopped=stop.is_set).open()
         with link:
+            with suppress(BusError):  # the router ends at this moment, and may be back
+                warn_of_absence(name, endpoint)
             number = asyncio.run(serve(link, bound, roles, page, kept=kept, hooks=hooks))
     if number == signal.SIGINT:
         raise Interrupted("The gateway was interrupted.")
+
+
+def warn_of_absence(fleet: str, endpoint: str) -> None:
+    """Log it if no participant of this fleet is online: its name may be mistyped.
+
+    Raises:
+        BusError: no router replies.
+    """
+    if fleet not in (fleets := fleets_at(endpoint)):
+        there = f"Fleets at {endpoint}: {listed(fleets)}."
+        _LOG.warning("No participant of the fleet '%s' is online yet. %s", fleet, there)
 
 
 def permitted_role(fleet: str, participant: RosterEntry | None, tokens: Mapping[str, Role]) -> Role:

@@ -25,6 +25,7 @@ from fleet.bus.protocol.auction import (
     QuoteRequest,
 )
 from fleet.bus.protocol.cell import Cell, CellRequest
+from fleet.bus.protocol.messages import unknown_field
 from fleet.bus.protocol.operator import (
     ALL_ARMS,
     Action,
@@ -37,6 +38,7 @@ from fleet.bus.protocol.operator import (
     ResetReply,
     ResetRequest,
     Resume,
+    without_reset,
 )
 from fleet.bus.security.tls import unknown_certificate_hint
 from fleet.errors import JOB_RULE, BusError, FleetError, Refused, is_name, nearest, printable, visible
@@ -198,7 +200,10 @@ def read_jobs(file: str, begin: str = "") -> dict[int, JobSpec]:
 
 def _decode(raw: bytes, kind: type[Decoded], where: str) -> Decoded:
     try:
-        return msgspec.json.decode(raw, type=kind)
+        decoded = msgspec.json.decode(raw, type=kind)
+        if unknown := unknown_field(kind, raw):
+            raise FleetError(f"{where}: {unknown}")
+        return decoded
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise FleetError(f"{where}: {explain(error)}") from error
 
@@ -332,6 +337,8 @@ def reset_arm(arm: str, by: str, endpoint: str, fleet: str) -> None:
         try:
             reply = link.ask(key, ResetRequest(_person(by)), ResetReply, timeout_s=REPLY_S)
         except NoReply as error:
+            if not error.late and link.tokens(keys.of_arm(link.fleet, arm, "alive")):
+                raise Refused(without_reset(arm)) from error
             raise BusError(f"The arm '{arm}' did not reply. {_NEEDS_ROLE}") from error
     echo(f"{arm}: its fault is cleared." if reply.changed else f"{arm}: it has no fault.")
 

@@ -10,7 +10,7 @@ from fleet.errors import FleetError
 from fleet.robot import JOINTS, ThermalLimits
 from scenarios.cli.options import Ros2Spec, split_names, the_fleet
 from scenarios.extras import require_extra
-from scenarios.live.arm import monitor_of
+from scenarios.live.arm import fleet_clock, monitor_of
 from scenarios.signals import StopRequest, until_stopped
 from scenarios.terminal import echo
 
@@ -54,7 +54,6 @@ def run_listener(topic: str, endpoint: str, fleet: str, spec: Ros2Spec) -> None:
     monitor = monitors and monitors(1.0 / spec.rate_hz)
     if monitor and len(names) != JOINTS:
         raise FleetError(f"--twin and --network are for arms of {JOINTS} joints (got {len(names)} in --joints).")
-    from fleet.live.clock import FleetClock
     from fleet.ros2.bridge import ArmReadings, Follower
 
     with (
@@ -62,7 +61,7 @@ def run_listener(topic: str, endpoint: str, fleet: str, spec: Ros2Spec) -> None:
         node_at(where, f"thermofleet_{spec.arm}", spec.domain, stop.is_set) as node,
         BusClient(endpoint, the_fleet(fleet, endpoint), stopped=stop.is_set) as link,
     ):
-        clock = FleetClock(1.0, time.monotonic())
+        clock = fleet_clock(link, None)
         limits = limits_of(spec.warning_c, max(spec.warning_c + 1.0, DEFAULTS.error_c))
         readings, topics = ArmReadings(names, spec.hardware), (topic, spec.temperatures)
         how = {"limits": limits, "rate_hz": spec.rate_hz, "monitor": monitor}

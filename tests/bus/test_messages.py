@@ -24,11 +24,20 @@ from fleet.bus.protocol.messages import (
     DifficultyScores,
     Info,
     MalformedMessage,
+    PersonRequest,
     State,
     check_name,
     decode,
     encode,
     encoding,
+)
+from fleet.bus.protocol.operator import (
+    Change,
+    ClearRequest,
+    ControlRequest,
+    Operation,
+    ResetRequest,
+    check_request,
 )
 from fleet.errors import is_name
 from fleet.events import EVENT_KINDS, MEANINGS
@@ -341,9 +350,10 @@ def test_the_schemas_are_schemas_and_every_word_has_an_example():
 
 @pytest.mark.parametrize("word", NAMED)
 def test_an_example_is_accepted_by_struct_and_schema(word):
-    for value in (example(word), {**example(word), "from a later version": 1}):
+    later = {**example(word), "from a later version": 1}
+    for value in (example(word), later):
         VALIDATORS[word].validate(value)
-        assert refused(word, value) == ""
+        assert (refused(word, value) == "") == (value is not later or not issubclass(word, PersonRequest))
     assert messages.decode(word, messages.encode(EXAMPLES[word])) == EXAMPLES[word]
 
 
@@ -391,6 +401,68 @@ def test_what_only_the_structs_refuse(word, change):
     value = {**whole, **change}
     assert Draft202012Validator({"$ref": f"#/$defs/{word.__name__}", "$defs": DOCUMENT["$defs"]}).is_valid(value)
     assert refused(word, value) == "rule"
+
+
+HOLD = {"name": "a", "kind": "hold", "places": ["rack"]}
+
+
+@pytest.mark.parametrize(
+    ("word", "value", "says"),
+    [
+        (
+            trade.Submission,
+            {"jobs": [HOLD], "bye": "ann"},
+            "Unknown field 'bye'; did you mean 'by'? Allowed: by, jobs.",
+        ),
+        (
+            trade.Submission,
+            {"jobs": [HOLD, {**HOLD, "payloadkg": 1}]},
+            "Unknown field 'payloadkg' in jobs[1]; did you mean 'payload_kg'? Allowed: after, alternatives, ",
+        ),
+        (
+            ControlRequest,
+            {"request": "1", "action": {"action": "resume", "arms": "arm_0"}},
+            "Unknown field 'arms' in action; did you mean 'arm'? Allowed: action, arm.",
+        ),
+        (
+            ControlRequest,
+            {"request": "1", "action": {"job": "a", "action": "change", "due": 5}},
+            "Unknown field 'due' in action; did you mean 'due_s'? Allowed: action, due_s, job, value.",
+        ),
+        (ClearRequest, {"arm": "a", "force": True}, "Unknown field 'force'. Allowed: arm, by."),
+        (ResetRequest, {"name": "ann"}, "Unknown field 'name'. Allowed: by."),
+    ],
+)
+def test_people_are_told_of_a_field_that_is_mistyped(word, value, says):
+    with pytest.raises(MalformedMessage, match=re.escape(says)):
+        decode(word, json.dumps(value).encode())
+
+
+def test_participants_may_send_fields_of_a_later_version():
+    value = {"auction": "1", "jobs": [{**HOLD, "colour": "red"}]}
+    assert decode(trade.QuoteRequest, json.dumps(value).encode()).jobs[0].name == "a"
+    operation = json.loads(encode(EXAMPLES[Operation]))
+    operation["request"]["later"] = operation["request"]["action"]["later"] = 1
+    assert decode(Operation, json.dumps(operation).encode()) == EXAMPLES[Operation]
+
+
+@pytest.mark.parametrize(
+    ("request_", "says"),
+    [
+        (ControlRequest("1", Change("a")), "Change needs due_s, value or both (got neither)."),
+        (
+            trade.Submission((JobSpec("a", "hold", ("rack",), expires=True),)),
+            "JobSpec.expires needs due_s, the hard due date (got none for 'a').",
+        ),
+        (
+            trade.Submission((JobSpec("a", "hold", ("rack",), force_n=10.0),)),
+            "only a press has a contact force (got 10 N for the hold 'a').",
+        ),
+    ],
+)
+def test_a_request_without_effect_is_refused(request_, says):
+    with pytest.raises(MalformedMessage, match=re.escape(says)):
+        check_request(decode(type(request_), encode(request_)))
 
 
 @pytest.mark.parametrize("word", NAMED)

@@ -93,6 +93,7 @@ def test_own_arm_follows_the_rules_of_a_strict_auctioneer(bus):
         serve_until(lambda: requests, auctioneer)  # it waits at its last cycle until it may begin it
         assert requests[0].entries[0].cycles == JOB.repetitions - 1
         assert not reports
+        serve_until(lambda: states[-1].busy_s == 6.0, auctioneer)  # a cycle of 0.1 s at speed 60
         permissions.append(True)
         serve_until(lambda: reports, auctioneer)
         assert (reports[0].outcome, reports[0].cycles, reports[0].job) == ("finished", 3, "crate 1")

@@ -286,6 +286,16 @@ def test_an_arm_that_left_earlier_is_missing_only_if_expected():
     assert faults(fleet(arm(), left), expected=("a", "b"))[0] == ["Not present: b."]
 
 
+def test_an_arm_that_left_earlier_is_missing_by_the_alarm_of_a_gateway():
+    absent = Alarm("m", 1, 5.0, "absent b", "absent", "b is absent: its process has ended.", "b")
+    says = ["An alarm of 'm' that nobody has acknowledged: b is absent: its process has ended."]
+    assert faults(fleet(arm(), alarms=(absent,)))[0] == says
+    assert faults(fleet(arm(), alarms=(absent,)), expected=("b",))[0] == ["Not present: b."]
+    for change in ({"by": "ann"}, {"ended_s": 6.0}, {"kind": "space"}):
+        assert faults(fleet(arm(), alarms=(msgspec.structs.replace(absent, **change),)))[0] == []
+    assert faults(fleet(arm(), arm(arm="b"), alarms=(absent,)))[0] == []
+
+
 @pytest.mark.parametrize("ahead_s", [(3.0,), (3.0, 2.5), (-3.0, -2.5)])
 def test_arms_that_are_all_off_the_same_way_are_one_warning(ahead_s):
     """As after a restart of the auctioneer, whose clock continues from its journal."""

@@ -6,15 +6,17 @@ from typing import Any, get_args
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from benchmarks.simulation.participants import CLIENT
 from fleet.bus.client import Replies
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import MOST_JOBS, JobSpec, JobState, Status, StatusRequest
-from fleet.bus.protocol.messages import MOST_BYTES, encode
+from fleet.bus.protocol.auction import MOST_JOBS, JobSpec, JobState, JobStatus, Status, StatusRequest
+from fleet.bus.protocol.messages import MOST_BYTES, State, encode
 from fleet.errors import Refused
 from fleet.live import job_client
 from fleet.live.job_client import query_statuses
+from fleet.live.job_rules import finish_s
 from fleet.live.records import JobEntry
 from tests.live.many_jobs import ManyJobs, entries
 from tests.waiting import PATIENCE_S
@@ -48,6 +50,14 @@ def test_the_first_page_has_unfinished_jobs_then_open_ones_then_the_newest_ended
     (named,) = pages(desk, ("shift", "awarded_0001", "?"))
     assert [status.job for status in named.jobs] == ["awarded_0001", "shift"]
     assert named.counts["finished"] == 300
+
+
+def test_the_finish_is_unknown_of_an_arm_that_does_not_say_how_long_it_is_busy():
+    status = JobStatus("a", "awarded", "x")
+    state = State("x", 1, 100.0, "working", (40.0,), 20.0, job="a")
+    assert finish_s(status, state) is None
+    assert finish_s(status, replace(state, busy_s=30.0)) == 130.0
+    assert finish_s(status, replace(state, busy_s=30.0, job="b")) is None
 
 
 def test_waiting_jobs_come_in_the_order_of_their_release():

@@ -18,6 +18,7 @@ import pytest
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import Clock, ClockRequest
 from fleet.bus.protocol.messages import State
 from fleet.bus.router import Router, open_client
 from fleet.bus.security.access_control import RosterEntry
@@ -31,7 +32,7 @@ from scenarios.live.fleet_processes import chosen_arms, free_port, how_to_watch,
 from scenarios.live.gateway import ROLES, check, check_token, permitted_role, read_tokens, run_gateway
 from scenarios.spec.options import LiveSpec
 from tests import commands
-from tests.waiting import PATIENCE_S, wait_until
+from tests.waiting import PATIENCE_S, serving, wait_until
 
 
 @pytest.fixture(scope="module")
@@ -409,6 +410,18 @@ def test_an_arm_is_published_in_ros_and_followed_again(monkeypatch):
         )
         assert commands.end(listen, signal.SIGTERM) == (0, "")
         assert commands.end(bridge, signal.SIGINT) == (130, "The bridge was interrupted.\n")
+
+
+def test_a_real_arm_does_not_join_a_fleet_that_runs_faster(thermofleet):
+    with Router() as router, BusClient(router.endpoint, "shop") as link:
+        present: list[tuple[str, bool]] = []
+        link.watch_tokens(keys.of_every_arm("shop", "alive"), lambda arm, there: present.append((arm, there)))
+        link.reply_to(keys.of_clock("shop"), ClockRequest, lambda _: Clock(time_s=0.0, speed=60.0))
+        with serving(link):
+            at = ("--arm", "real", "--endpoint", router.endpoint, "--fleet", "shop", "--domain", 0)
+            ended = thermofleet("bus", "ros2", "listen", "/joint_states", "--temperatures", "/diagnostics", *at)
+    assert ended.refused("The fleet 'shop' runs 60 times as fast as a real arm: its speed must be 1.")
+    assert (ended.out, present) == ("", [])
 
 
 def test_a_missing_extra_is_named(thermofleet, monkeypatch):

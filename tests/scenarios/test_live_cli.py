@@ -443,6 +443,8 @@ def test_jobs_are_read_from_lines_or_a_list(tmp_path):
         (json.dumps(HOLD | {"repetitions": 0}), "line 1: JobSpec.repetitions must be between 1 and 100000 (got 0)."),
         (json.dumps([HOLD, HOLD | {"kind": "dance"}]), "No kind of job 'dance'. Allowed: hold, pick_place, press,"),
         (json.dumps(HOLD | {"places": ["a", "b"]}), "line 1: JobSpec.places must be one place for a hold (got a, b)."),
+        (json.dumps(HOLD | {"payloadkg": 1}), "line 1: Unknown field 'payloadkg'; did you mean 'payload_kg'? Allowed:"),
+        (json.dumps([HOLD | {"payloadkg": 1}]), "Unknown field 'payloadkg' in [0]; did you mean 'payload_kg'?"),
         ("{", "line 1: Input data was truncated."),
         ("\n", "contains no jobs."),
         ("\xff", "line 1: "),

@@ -28,6 +28,7 @@ from fleet.bus.protocol.messages import (
     Name,
     Number,
     Person,
+    PersonRequest,
     Share,
 )
 from fleet.errors import check_names
@@ -113,7 +114,7 @@ class JobSpec(msgspec.Struct, frozen=True, omit_defaults=True):
 Jobs = Annotated[tuple[JobSpec, ...], msgspec.Meta(min_length=1, max_length=MOST_JOBS)]
 
 
-class Submission(msgspec.Struct, frozen=True):
+class Submission(PersonRequest, frozen=True):
     """Request to `jobs/submit`: add jobs. The same job submitted twice is one job."""
 
     jobs: Jobs

@@ -2,18 +2,24 @@
 
 A message is validated when it is constructed, so by its sender and by its reader: NaN and infinity are refused (a JSON
 writer would silently turn them into `null`), an unknown score is `null`. Unknown fields are ignored, so a later version
-may add some; a change that a reader of this version could misread takes a new version in the schema name.
+may add some, but not in a `PersonRequest`: there they are refused, as they may be mistyped. A change that a reader of
+this version could misread takes a new version in the schema name.
 """
 
 from collections.abc import Iterable, Iterator
 from functools import cache
 from math import isfinite
-from typing import Annotated, TypeVar
+from typing import (
+    Annotated,
+    Any,  # a type
+    TypeVar,
+    cast,
+)
 
 import msgspec
 from msgspec import inspect
 
-from fleet.errors import BusError
+from fleet.errors import BusError, nearest, printable
 from fleet.telemetry import Mode
 
 VERSION = 4
@@ -51,6 +57,10 @@ class FiniteStruct(msgspec.Struct, frozen=True):
                     raise ValueError(f"{type(self).__name__}.{name} must be finite (got {number}).")
 
 
+class PersonRequest(msgspec.Struct, frozen=True):
+    """A request that people send: `decode` refuses fields that it does not have."""
+
+
 def _check_length(message: msgspec.Struct, field: str, item: str, count: int) -> None:
     values = getattr(message, field)
     if len(values) != count:
@@ -74,7 +84,8 @@ class State(FiniteStruct, frozen=True, omit_defaults=True):
     space: str = ""
     """Name of the space that the arm takes while it is away from home; "" at home, or if not reported."""
     busy_s: Duration = 0.0
-    """Time until it is home with its current job done."""
+    """Time until it is home with its current job done; 0 for unknown while it has a job, whose status then has no
+    `finish_s`."""
     housing_c: tuple[Celsius, ...] = ()
     """Estimated housing temperatures, which have no sensor, [joint]."""
     ambient_c: Celsius | None = None
@@ -212,7 +223,8 @@ def decode(kind: type[Message], payload: bytes, sent_encoding: str | None = None
         sent_encoding: The encoding that it was sent with; None for a payload from elsewhere, of any size.
 
     Raises:
-        MalformedMessage: larger than `MOST_BYTES`, another encoding, not JSON, or not of this type.
+        MalformedMessage: larger than `MOST_BYTES`, another encoding, not JSON, not of this type, or a `PersonRequest`
+            with an unknown field.
     """
     if sent_encoding is not None:
         if len(payload) > MOST_BYTES:
@@ -220,9 +232,13 @@ def decode(kind: type[Message], payload: bytes, sent_encoding: str | None = None
         if sent_encoding != encoding(kind):
             raise MalformedMessage(f"It is encoded as '{sent_encoding}', not as '{encoding(kind)}'.")
     try:
-        return _decoder(kind).decode(payload)
+        message: Message = _decoder(kind).decode(payload)
+        unknown = unknown_field(kind, payload) if issubclass(kind, PersonRequest) else ""
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise MalformedMessage(f"Not a {schema(kind)}: {error}{_allowed(kind, str(error))}") from error
+    if unknown:
+        raise MalformedMessage(f"Not a {schema(kind)}: {unknown}")
+    return message
 
 
 def _allowed(kind: type, error: str) -> str:
@@ -234,7 +250,7 @@ def _allowed(kind: type, error: str) -> str:
     for name in path.rstrip("`").split("."):
         name, _, of_list = name.partition("[")
         structs = [each for each in _alternatives(at) if isinstance(each, inspect.StructType)]
-        tags = [each.tag for each in structs if each.tag_field == name]
+        tags = [each.tag for each in structs if each.tag_field == name and not hasattr(each.cls, "PUBLISHED_ONLY")]
         if tags:
             return f". Allowed: {', '.join(sorted(map(str, tags)))}"
         at = [field.type for each in structs for field in each.fields if field.encode_name == name]
@@ -243,6 +259,35 @@ def _allowed(kind: type, error: str) -> str:
             at = [each.value_type if isinstance(each, inspect.DictType) else each.item_type for each in lists]
     values = [value for each in _alternatives(at) if isinstance(each, inspect.LiteralType) for value in each.values]
     return f". Allowed: {', '.join(sorted(map(str, values)))}" if values else ""
+
+
+def unknown_field(kind: Any, payload: bytes) -> str:
+    """Sentence that names a field which a JSON value of this type does not have, and the allowed ones; "" for none.
+
+    Args:
+        kind: Any type that msgspec decodes.
+    """
+    return _unknown_field([inspect.type_info(kind)], msgspec.json.decode(payload), "")
+
+
+def _unknown_field(types: Iterable[inspect.Type], value: object, path: str) -> str:
+    parts: Iterable[tuple[inspect.Type, object, str]] = ()
+    for each in _alternatives(types):
+        if isinstance(each, inspect.StructType) and isinstance(value, dict):
+            fields = cast("dict[str, object]", value)
+            if each.tag_field and fields.get(each.tag_field) != each.tag:
+                continue
+            inner = {field.encode_name: field.type for field in each.fields}
+            allowed = [*inner, each.tag_field] if each.tag_field else [*inner]
+            for name in fields:
+                if name not in allowed:
+                    where = f" in {path}" if path else ""
+                    return f"Unknown field '{printable(name)}'{where}{nearest(name, allowed)}"
+            at = f"{path}." if path else ""
+            parts = [(inner[name], part, f"{at}{name}") for name, part in fields.items() if name in inner]
+        elif isinstance(each, inspect.ListType | inspect.VarTupleType) and isinstance(value, list):
+            parts = [(each.item_type, part, f"{path}[{i}]") for i, part in enumerate(cast("list[object]", value))]
+    return next(filter(None, (_unknown_field([kind], part, where) for kind, part, where in parts)), "")
 
 
 def _alternatives(types: Iterable[inspect.Type]) -> Iterator[inspect.Type]:

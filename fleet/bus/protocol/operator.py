@@ -1,11 +1,11 @@
 """Requests of operators."""
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import msgspec
 
-from fleet.bus.protocol.auction import JobStatus
-from fleet.bus.protocol.messages import Count, FiniteStruct, MalformedMessage, Name, Number, Person
+from fleet.bus.protocol.auction import JobSpec, JobStatus
+from fleet.bus.protocol.messages import Count, FiniteStruct, MalformedMessage, Name, Number, Person, PersonRequest
 from fleet.errors import check_names
 from fleet.job import check_bounds
 
@@ -19,7 +19,7 @@ def by_whom(by: str) -> str:
     return f" by '{by}'" if by else ""
 
 
-class ClearRequest(msgspec.Struct, frozen=True):
+class ClearRequest(PersonRequest, frozen=True):
     """Request to `jobs/clear`: free the space of an absent arm, and end its awards. The same request again changes
     nothing.
 
@@ -88,13 +88,14 @@ class Resume(msgspec.Struct, frozen=True, tag_field="action", tag="resume"):
 class Clear(msgspec.Struct, frozen=True, tag_field="action", tag="clear"):
     """The space of an absent arm was freed. Only in an `Operation`: it is requested by a `ClearRequest`."""
 
+    PUBLISHED_ONLY: ClassVar[bool] = True
     arm: Name
 
 
 Action = Cancel | Settle | Change | Pause | Resume | Clear
 
 
-class ControlRequest(msgspec.Struct, frozen=True):
+class ControlRequest(PersonRequest, frozen=True):
     """Request to `jobs/control`: steer jobs and arms. It is idempotent."""
 
     request: Annotated[str, msgspec.Meta(min_length=1, max_length=MAX_REQUEST_NAME)]
@@ -121,7 +122,7 @@ class Controlled(msgspec.Struct, frozen=True):
 
 
 def check_request(request: msgspec.Struct) -> None:
-    """Check who makes a new request, and the values of a change.
+    """Check who makes a new request, and what only new requests must have.
 
     Messages in journals and recordings are not checked: an earlier version may have accepted them.
 
@@ -133,18 +134,37 @@ def check_request(request: msgspec.Struct) -> None:
         if getattr(request, "by", ""):
             check_names(request, "by", of_jobs=True)
         if isinstance(action, Change):
-            given = (name for name in ("due_s", "value") if getattr(action, name) is not msgspec.UNSET)
+            given = [name for name in ("due_s", "value") if getattr(action, name) is not msgspec.UNSET]
+            if not given:
+                raise ValueError("Change needs due_s, value or both (got neither).")
             check_bounds(action, *given)
+        if isinstance(request, PersonRequest):
+            for job in getattr(request, "jobs", ()):
+                _check_new(job)
     except ValueError as error:
         raise MalformedMessage(str(error)) from error
 
 
-class ResetRequest(msgspec.Struct, frozen=True):
+def _check_new(job: JobSpec) -> None:
+    """Check what only new jobs must have; raises ValueError."""
+    if job.force_n and job.kind != "press":
+        got = f"(got {job.force_n:g} N for the {job.kind} '{job.name}')"
+        raise ValueError(f"JobSpec.force_n must be 0 or left out: only a press has a contact force {got}.")
+    if job.expires and job.due_s is None:
+        raise ValueError(f"JobSpec.expires needs due_s, the hard due date (got none for '{job.name}').")
+
+
+class ResetRequest(PersonRequest, frozen=True):
     """Request to `arm/{arm}/reset`: clear the fault of an arm now, instead of waiting for it to clear. The arm then
     ends its cycle and moves home: keep people and objects out of its way. Without a fault nothing changes."""
 
     by: Person = ""
     """Who requests it, for journal and event."""
+
+
+def without_reset(arm: str) -> str:
+    """Return why an online arm does not reply to a `ResetRequest`."""
+    return f"The arm '{arm}' is online and offers no reset: its fault must be cleared at the arm."
 
 
 class ResetReply(msgspec.Struct, frozen=True):

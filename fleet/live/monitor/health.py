@@ -151,8 +151,15 @@ def check_health(
         off = f"Every arm is {abs(common_s):.1f} real seconds or more {way} fleet time."
         why = "After a restart of the auctioneer that ends within 2 min; otherwise its machine may be overloaded."
         findings.append(Finding("warning", f"{off} {why}"))
-    if missing := [name for name in expected if name not in {arm.arm for arm in fleet.arms if arm.token}]:
+    shown = {arm.arm for arm in fleet.arms if arm.token}
+    if missing := [name for name in expected if name not in shown]:
         findings.append(Finding("fault", f"Not present: {', '.join(missing)}."))
+    listed = {arm.arm for arm in fleet.arms} | {*expected}
+    findings += [
+        Finding("fault", f"An alarm of '{alarm.monitor}' that nobody has acknowledged: {alarm.what}")
+        for alarm in fleet.alarms
+        if alarm.kind == "absent" and alarm.ended_s is None and not alarm.by and alarm.subject not in listed
+    ]
     if not any(arm.present for arm in fleet.arms):
         unheard = secure and not any(arm.token for arm in fleet.arms)
         hint = UNKNOWN_CERTIFICATE if unheard else ""

@@ -17,13 +17,16 @@ from pathlib import Path
 import pytest
 
 from fleet.bus.client import BusClient
+from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Admission, Status, SubmissionReply
+from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import ControlRequest, Operation, Pause, ResetRequest, Resume
 from fleet.bus.router import Router
-from fleet.errors import RefusedForNow
+from fleet.errors import Refused, RefusedForNow
 from fleet.live.monitor.snapshot import FleetView
 from scenarios.live.fleet_processes import page_of
 from scenarios.live.gateway import FILES, MAX_BYTES, MAX_TABLE_BYTES, LivePage, scene_of
+from scenarios.live.requests import reset_arm
 from scenarios.spec.load import load
 from tests import commands
 from tests.live.gateway.moving_fleet import MovingFleet
@@ -35,7 +38,7 @@ BROWSER = {"Accept": "text/html,application/xhtml+xml,application/xml;q=0.9,*/*;
 CRATE_JSON = {"name": "crate 1", "kind": "hold", "places": ["rack"]}
 JSON = "application/json"
 PAUSE = {"request": "1", "action": {"action": "pause"}}
-FLY, LATE = {"action": "fly"}, {"action": "change", "job": "a", "due_s": -5}
+ARMS, FLY, LATE = {"action": "resume", "arms": "a"}, {"action": "fly"}, {"action": "change", "job": "a", "due_s": -5}
 SETTLE = {"action": "settle", "job": "a", "outcome": "so"}
 CSV = {"Content-Type": "text/csv; charset=utf-8"}
 WATCHER, SENDER, BOSS = "watcher-watcher-watcher", "sender-sender-sender", "operator-operator-operator"
@@ -88,8 +91,10 @@ def test_without_the_page_the_gateway_serves_no_html(router, arm):
 
 def test_the_page_needs_no_token_and_everything_about_the_fleet_does(guarded):
     for wrong in ("Bearer wrong", f"Basic {BOSS}", f"Bearer {BOSS}x", f"Bearer {BOSS[:-1]}"):
-        status, kind, _ = guarded.ask("GET", "/v4/fleet", headers={"Authorization": wrong})
+        status, kind, reply = guarded.ask("GET", "/v4/fleet", headers={"Authorization": wrong})
         assert (status, kind) == (401, "application/problem+json"), wrong
+        says = "This gateway needs a token" if wrong.startswith("Basic") else "This token is not valid."
+        assert reply["detail"].startswith(says)
     assert guarded.ask("GET", "/v4/fleet", headers={"Authorization": f"bearer {BOSS}", "Host": "any"})[0] == 200
     assert get(guarded, "/", BROWSER)[0] == 200
     assert get(guarded, "/page/dashboard.js")[0] == 200
@@ -149,6 +154,25 @@ def test_a_fault_is_reset_over_http(gateway, arm):
     assert status == 404
     assert reply["detail"].startswith("There is no arm 'nobody'. Arms: a+1")
     assert gateway.ask(*token, {"arm": "a/b"})[0] == 422
+
+
+def test_an_online_arm_that_offers_no_reset_is_not_called_offline():
+    with Router() as own_router, Served(own_router.endpoint) as gateway, BusClient(own_router.endpoint, "f") as own:
+        own.declare_token(keys.of_arm("f", "own", "alive"))
+        tell = own.publisher(keys.of_arm("f", "own", "state"), State)
+
+        def is_present():
+            tell(State("own", 1, 1.0, "faulted", (40.0,), 20.0))
+            return any(arm["arm"] == "own" and arm["present"] for arm in gateway.ask("GET", "/v4/fleet")[2]["arms"])
+
+        wait_until(is_present)
+        status, _, reply = gateway.ask("POST", "/v4/reset", {"arm": "own"})
+        with pytest.raises(Refused, match="'own' is online and offers no reset"):
+            reset_arm("own", "ann", own_router.endpoint, "f")
+    assert (status, reply["detail"]) == (
+        409,
+        "The arm 'own' is online and offers no reset: its fault must be cleared at the arm.",
+    )
 
 
 def test_the_snapshot_names_the_paused_arms_and_as_many_jobs_as_asked_for(gateway, arm):
@@ -235,7 +259,7 @@ PROBLEMS = [
     (405, "DELETE /v4/jobs", "Not Allowed"),
     (421, "GET /v4/fleet", "evil.example", None, {"Host": "evil.example"}),
     (421, "GET /page/cell.js", "evil.example", None, {"Host": "evil.example:80"}),
-    (422, "POST /v4/control", "`. Allowed: cancel, change, clear, pause, resume, settle", {**PAUSE, "action": FLY}),
+    (422, "POST /v4/control", "`. Allowed: cancel, change, pause, resume, settle", {**PAUSE, "action": FLY}),
     (422, "POST /v4/control", "`. Allowed: done, redo", {**PAUSE, "action": SETTLE}),
     (422, "POST /v4/jobs", "Submission.by must have 1 to 128 printable", {"jobs": [CRATE_JSON], "by": "a\nb"}),
     (422, "POST /v4/jobs?by=%1b", "Submission.by must have 1 to 128", b"name,kind,places\na,hold,pallet", CSV),
@@ -244,6 +268,10 @@ PROBLEMS = [
     (422, "POST /v4/reset", "ResetBody.by must have 1 to 128 printable", {"arm": "a+1", "by": "\r"}),
     (422, "POST /v4/alarms", "AcknowledgeBody.by must have 1 to 128 printable", {"alarm": "a", "by": "\r"}),
     (422, "POST /v4/control", "Change.due_s must be between 0 and", {**PAUSE, "action": LATE}),
+    (422, "POST /v4/control", "Unknown field 'arms' in action; did you mean 'arm'?", {**PAUSE, "action": ARMS}),
+    (422, "POST /v4/ask", "Unknown field 'payloadkg' in jobs[0]", {"jobs": [{**CRATE_JSON, "payloadkg": 1}]}),
+    (422, "POST /v4/reset", "Unknown field 'name'. Allowed: arm, by.", {"arm": "a+1", "name": ""}),
+    (422, "POST /v4/alarms", "Unknown field 'who'. Allowed: alarm, by.", {"alarm": "a", "by": "b", "who": "c"}),
     (422, "POST /v4/alarms", "An object has the field 'by' twice.", '{"alarm": "a", "by": "b", "by": "c"}'),
     (422, "POST /v4/alarms", "Not", b'{"alarm": "a", "by": "b", "x": "\xff"}'),
     (422, "POST /v4/jobs?by=erp", "Parameters are for a table (text/csv);", {"jobs": [CRATE_JSON]}),
@@ -431,7 +459,9 @@ def test_a_reader_that_reconnects_misses_no_event(gateway, arm):
         found = events(file, lambda found: set(numbers_of(found)) >= {100, 101, 102, 103})
     assert found[0] == (None, "gap", {})
     with gateway.stream({"Last-Event-ID": "otherlife-99999999"}) as (_, file):  # before a restart: all again
-        assert events(file, lambda found: set(numbers_of(found)) >= {100, 101, 102, 103})
+        found = events(file, lambda found: set(numbers_of(found)) >= {100, 101, 102, 103})
+    assert found[0] == (None, "gap", {})
+    assert not of("gap", found[1:])
 
 
 def test_a_silent_stream_sends_heartbeats(monkeypatch):
@@ -535,6 +565,13 @@ def test_the_command_exits_on_a_signal_even_while_a_reader_is_connected(router, 
         assert started.wait(PATIENCE_S) == code
         line.close()
         assert "Traceback" not in started.stderr.read()
+
+
+def test_a_gateway_of_a_fleet_without_participants_names_those_that_have_some(router, arm):
+    with process(router, "--fleet", "nofleet") as (started, _):
+        started.terminate()
+        said = started.communicate(timeout=PATIENCE_S)[1]
+    assert f"No participant of the fleet 'nofleet' is online yet. Fleets at {router}: f." in said
 
 
 @pytest.mark.ci_slow
