@@ -21,7 +21,7 @@ from fleet.bus.protocol.keys import of_arm
 from fleet.errors import BusError
 from fleet.live.consensus.node import ConsensusNode
 from scenarios.live.arm import refuse_auctioneer
-from tests.live.simulated import SPEED, SimulatedFleet, job, refused
+from tests.live.simulated import LONG, SPEED, SimulatedFleet, job, refused
 from tests.profiles import examples
 
 ARM_POLICIES = [name for name, rule in RULES.items() if rule.scope == "arm"]
@@ -232,3 +232,57 @@ def test_an_arm_that_lost_its_journals_does_not_join_unless_a_person_requests_it
     fleet.submit(job("d", 2))
     fleet.until(lambda: fleet.is_everywhere("d", "finished"))
     assert fleet.finished == dict.fromkeys("abcd", 1)
+
+
+# Journals that are lost or older, and the last cycle
+
+
+def lose_files(fleet: SimulatedFleet, arm: str, prefix: str = "") -> None:
+    """Remove the files of a killed arm whose names begin so; its events begin their numbers again."""
+    disk = fleet.world.processes[arm].disk
+    disk.names = {name: file for name, file in disk.names.items() if not name.startswith(prefix)}
+    disk._durable = dict(disk.names)
+    fleet.world.bus.on_publish = lambda *_: None
+
+
+def killed_in_last_cycle(fleet: SimulatedFleet) -> str:
+    """Return the arm that was killed in the last cycle of job a."""
+    fleet.submit(job("a", 1, **LONG))
+    fleet.until(lambda: bool(fleet.begun))
+    (arm,) = fleet.away
+    fleet.world.processes[arm].kill("is killed")
+    return arm
+
+
+@pytest.mark.parametrize("absent_s", [0.0, 6.0])
+def test_a_last_cycle_is_not_begun_again_if_its_arm_lost_only_its_awards(fleet_of, absent_s):
+    fleet = fleet_of(True)
+    arm = killed_in_last_cycle(fleet)
+    lose_files(fleet, arm, "awards")
+    fleet.run(absent_s)
+    fleet.world.processes[arm].start()
+    fleet.run(30.0)
+    assert (fleet.begun, fleet.states("a")) == ({"a": 1}, {"unfinished"})
+
+
+@pytest.mark.parametrize("next_fault", ["none", "crash", "cut"])
+@pytest.mark.parametrize("absent_s", [0.0, 6.0])
+def test_a_last_cycle_is_not_begun_again_if_its_arm_lost_all_journals(fleet_of, absent_s, next_fault):
+    """Also if its second claim after the start with `new_epoch` reaches nobody."""
+    fleet = fleet_of(True)
+    arm = killed_in_last_cycle(fleet)
+    lose_files(fleet, arm)
+    fleet.run(absent_s)
+    fleet.builders[arm].new_epoch = True
+    fleet.world.processes[arm].start()
+
+    def claims():
+        return fleet.node(arm) and fleet.node(arm).work_source.participant.claimant._sent
+
+    assert fleet.world.run(fleet.world.now_s + 10.0, claims)
+    if next_fault == "crash":
+        fleet.world.processes[arm].kill("is killed again")
+    elif next_fault == "cut":
+        fleet.world.after(0.001, fleet.cut, arm)
+    fleet.run(30.0)
+    assert (fleet.begun, fleet.states("a")) == ({"a": 1}, {"unfinished"})

@@ -5,12 +5,13 @@ The rules that make grants safe are at the head of `fleet.live.book`; the quorum
 To the arm's `AwardExecutor` its `Claimant` acts as an auctioneer: a job that a majority grants is an award, its lease
 counts from the moment of the query to the last arm of a majority, and an outcome that a majority has on disk is
 receipted. Every claim lists all jobs that the arm has, requests and reports: a peer that misses a job there that it has
-granted knows that the arm has released it.
+granted knows that the arm has released it. A claim therefore also reports the jobs for which the arm had permission to
+commit, by its own grants, and which its journal of awards lacks: until a majority has them as unfinished.
 """
 
 import logging
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass, field
 
 from msgspec.structs import replace
@@ -250,6 +251,8 @@ CLAIM_S = 0.5
 """Real seconds after which a claim is repeated for peers that have not replied."""
 PENDING_S = 2.0
 """Real seconds after which an arm withdraws a request that no majority grants."""
+LOST = "The journal of its arm was lost after it had permission to commit."
+"""Why a job is unfinished of which the arm itself has no record."""
 MAX_CORRECTIONS = 32
 """In one claim."""
 MAX_CLAIMS = 64
@@ -463,7 +466,22 @@ class Claimant:
                 phase = "finishing" if last.phase == "finishing" else "working"
                 entries.append(replace(last, cycles=report.cycles, phase=phase))
         self._last_entries = {entry.award: entry for entry in entries}
-        return entries, outcomes
+        outcomes += self._lost_jobs({*self._last_entries, *(outcome.award for outcome in outcomes)})
+        return entries, outcomes[:MOST_JOBS]
+
+    def _lost_jobs(self, claimed: Container[str]) -> list[JobOutcome]:
+        """Return unfinished jobs of this arm that it neither has nor reports, and that no majority is known to have."""
+        lost: list[JobOutcome] = []
+        for entry in self.granter.book.jobs.values():
+            outcome, grant = entry.outcome, entry.grant
+            if grant is not None and grant.may_commit and grant.record.arm == self.arm:
+                terms = (grant.record.award, self.arm, "unfinished", entry.cycles, self.granter.book.time_s, LOST)
+                outcome = JobOutcome(entry.name, *terms)
+            if outcome is None or (outcome.outcome, outcome.arm) != ("unfinished", self.arm):
+                continue
+            if outcome.award not in claimed and len(self._receipts.setdefault(outcome.award, set())) < self.majority:
+                lost.append(outcome)
+        return lost
 
     def _count_votes(self, real_s: float) -> None:
         """Act on the replies of a majority."""
