@@ -3,6 +3,7 @@
 import random
 import re
 from contextlib import nullcontext
+from copy import deepcopy
 from functools import partial
 from itertools import islice
 
@@ -286,3 +287,34 @@ def test_a_last_cycle_is_not_begun_again_if_its_arm_lost_all_journals(fleet_of, 
         fleet.world.after(0.001, fleet.cut, arm)
     fleet.run(30.0)
     assert (fleet.begun, fleet.states("a")) == ({"a": 1}, {"unfinished"})
+
+
+@pytest.mark.parametrize("witness_first", [True, False])
+def test_a_restored_copy_of_a_granter_from_before_its_last_start_is_noticed(fleet_of, witness_first):
+    """By the peer that has forgotten all but the first claim of that start."""
+    fleet = fleet_of(True, trace=True)
+    processes = fleet.world.processes
+    fleet.submit(job("a", 1, release_s=100.0, **LONG))
+    fleet.run(3.0)
+    *others, witness = fleet.arms
+    for arm in others:
+        processes[arm].kill("is stopped")
+    copies = {arm: deepcopy(processes[arm].disk.names) for arm in others}
+    for arm in others:
+        processes[arm].start()
+    fleet.run(2.0)
+    processes[witness].kill("is killed")
+    fleet.until(lambda: bool(fleet.begun))
+    (holder,) = fleet.away
+    (granter,) = {*others} - {holder}
+    fleet.cut(holder)
+    processes[granter].kill("is killed")
+    disk = processes[granter].disk
+    disk.names, disk._durable = copies[granter], dict(copies[granter])
+    fleet.run(8.0)
+    for arm in (witness, granter) if witness_first else (granter, witness):
+        processes[arm].start()
+        fleet.run(3.0)
+    fleet.run(40.0)
+    assert fleet.logged("'arm_2' knows claims of")
+    assert (processes[granter].up, fleet.begun) == (False, {"a": 1})

@@ -85,6 +85,8 @@ class Granter:
         last = book.numbers.get(claim.arm, -1)
         if claim.number <= last:
             raise Refused(f"Stale claim {claim.number} from '{claim.arm}' (latest {last}).")
+        if claim.number // NUMBERS_PER_BOOT > last // NUMBERS_PER_BOOT:  # by it, that arm notices an older copy
+            book.record(ClaimNumbered(claim.arm, claim.number))
         self.add_jobs(claim.jobs)
         for outcome in claim.outcomes:
             self.apply_outcome(outcome)

@@ -104,7 +104,7 @@ class ConsensusNode(JobDesk):
         link, fleet, name = self._link, self._link.fleet, self._name
         link.reply_to(keys.of_arm(fleet, name, "history"), HistoryRequest, self._history)
         self._joined = False
-        """Its peers were asked, when there were any, whether its journals are those that they know."""
+        """A majority, with this arm, was asked whether its journals are those that it knows."""
         self._asked_s = -math.inf
         self._failure: BusError | None = None
         self._join(ask_arms(link))  # before it grants anything
@@ -170,19 +170,21 @@ class ConsensusNode(JobDesk):
                 granter.adopt(adopted(self.book, history), time.monotonic())
             self.participant.count_after(known)
         self._take_epoch(next((history.epoch for history in histories if history.epoch), ""))
+        # Fewer than a majority may not know of an epoch, or of claims of this arm, that the others know.
+        self._joined = len({each.arm for each in histories} | {self._name}) >= self._majority
 
     def _ask_peers(self, real_s: float) -> None:
-        """Ask all peers what they know, before this arm takes or names an epoch."""
+        """Ask all peers what they know, before this arm takes part."""
         if real_s < self._asked_s + REPLY_S:
             return
         self._asked_s = real_s
 
         def done(replies: Replies[History]) -> None:
             histories = tuple(replies.messages.values())
+            if self._joined:  # since then it may have claimed, and its peers know that
+                return
             try:
                 self._join(histories)
-                # Fewer than a majority may not know of an epoch that the others have begun.
-                self._joined = len({each.arm for each in histories} | {self._name}) >= self._majority
             except Refused as error:
                 self._warn("journal", f"cannot record what its peers know: {error}")
             except BusError as error:
@@ -223,10 +225,10 @@ class ConsensusNode(JobDesk):
         roster = self.participant.granter.roster
         present = len(self._tokens & roster | {self._name})
         if present < self._majority:
-            self._since_s, self._joined = real_s, False  # meanwhile the others may begin an epoch
+            self._since_s, self._joined = real_s, self._joined and self._epoch != ""  # the others may begin one
         elif real_s - self._since_s >= (LISTEN_S if present == len(roster) else PATIENCE_S):
             first = self._name == min(self._tokens & roster | {self._name})
-            if not (self._epoch or self._joined):
+            if not self._joined:
                 self._ask_peers(real_s)
                 return
             if not (self._epoch or first):  # the first by name names the epoch; its bid begins the fleet's time here
@@ -262,7 +264,7 @@ class ConsensusNode(JobDesk):
         real_s = time.monotonic()
         if arm == self._name or arm not in self.participant.granter.roster:
             return
-        if bid.epoch and not (self._epoch or self._joined):
+        if not (self._begun or self._joined):
             self._ask_peers(real_s)
             return
         if not self._take_epoch(bid.epoch) and not self._begun:
