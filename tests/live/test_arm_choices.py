@@ -19,6 +19,7 @@ from benchmarks.simulation.simulated_fleet import FIRST
 from fleet.bus.client import AnotherReplies
 from fleet.bus.protocol.auction import Ack, Award
 from fleet.bus.protocol.keys import of_arm
+from fleet.bus.protocol.operator import Settle
 from fleet.errors import BusError
 from fleet.live.consensus.node import ConsensusNode
 from scenarios.live.arm import refuse_auctioneer
@@ -247,8 +248,13 @@ def lose_files(fleet: SimulatedFleet, arm: str, prefix: str = "") -> None:
 
 
 def killed_in_last_cycle(fleet: SimulatedFleet) -> str:
-    """Return the arm that was killed in the last cycle of job a."""
+    """Return the arm that was killed in the last cycle of job a, which this submits."""
     fleet.submit(job("a", 1, **LONG))
+    return killed(fleet)
+
+
+def killed(fleet: SimulatedFleet) -> str:
+    """Return the arm that was killed in the last cycle of the only job."""
     fleet.until(lambda: bool(fleet.begun))
     (arm,) = fleet.away
     fleet.world.processes[arm].kill("is killed")
@@ -318,3 +324,29 @@ def test_a_restored_copy_of_a_granter_from_before_its_last_start_is_noticed(flee
     fleet.run(40.0)
     assert fleet.logged("'arm_2' knows claims of")
     assert (processes[granter].up, fleet.begun) == (False, {"a": 1})
+
+
+@pytest.mark.parametrize("outcome", ["done", "redo"])
+@pytest.mark.parametrize("cleared", ["never", "before", "after"])
+def test_a_job_lost_in_its_last_cycle_is_settled_at_an_arm_that_was_cut_off_meanwhile(fleet_of, cleared, outcome):
+    """At first that arm requests the job itself; its peer names the arm that has permission to commit."""
+    fleet = fleet_of(True)
+    fleet.submit(job("a", 1, release_s=80.0, **LONG))
+    fleet.run(3.0)
+    fleet.cut("arm_0")
+    arm = killed(fleet)
+    fleet.move_home(arm)
+    fleet.run(8.0)
+    if cleared == "before":
+        fleet.free_space(arm)
+    fleet.cut()
+    fleet.run(20.0)
+    assert fleet.is_everywhere("a", "unfinished")
+    if cleared != "after" and outcome == "redo":
+        assert "may still do the last cycle" in refused(lambda: fleet.control(Settle("a", outcome)))
+    if cleared == "after" or outcome == "redo":
+        fleet.free_space(arm)
+    fleet.begun.clear()
+    fleet.control(Settle("a", outcome))
+    fleet.until(lambda: fleet.is_everywhere("a", "finished"))
+    assert fleet.begun == ({} if outcome == "done" else {"a": 1})

@@ -127,6 +127,8 @@ class DeniedEntry(msgspec.Struct, frozen=True):
     reason: str
     outcome: JobOutcome | None = None
     """Its outcome, if it has one."""
+    committed: JobOutcome | None = None
+    """Without one: the award of another arm with permission to commit, as in `History`. The claimer records it."""
 
 
 class ClaimReply(msgspec.Struct, frozen=True):

@@ -17,12 +17,22 @@ from dataclasses import dataclass, field
 from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import MOST_JOBS, Ack, Award, JobSpec, Lease, Receipt
-from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, DeniedEntry, Faults, GrantedEntry, JobOutcome
+from fleet.bus.protocol.consensus import (
+    Claim,
+    ClaimEntry,
+    ClaimReply,
+    DeniedEntry,
+    Faults,
+    GrantedEntry,
+    History,
+    JobOutcome,
+)
 from fleet.bus.protocol.operator import ALL_ARMS, Operation, Pause, Resume
 from fleet.errors import JournalError, JournalFull, Refused
 from fleet.job import reason_to_give_up
 from fleet.live.arm.awards import REVOKED, ActiveAward, AwardExecutor
 from fleet.live.book import MAX_SETTLED, JobBook
+from fleet.live.epochs import adopted, committed_job
 from fleet.live.job_rules import MAX_OPEN_JOBS
 from fleet.live.journal import JobsAccepted, Progress, Released, SpaceTaken
 from fleet.live.leases import Timing, clear, expire, renewal
@@ -103,7 +113,7 @@ class Granter:
         denied: list[DeniedEntry] = []
         for entry in claim.entries:
             if reason := self._objection(claim.arm, entry, real_s) or self._grant(claim, entry, real_s):
-                denied.append(DeniedEntry(entry.award, reason, self.known_outcome(entry.job)))
+                denied.append(self._denied(claim.arm, entry, reason))
             else:
                 job = book.jobs[entry.job]
                 may_commit = job.grant is not None and job.grant.may_commit
@@ -218,6 +228,13 @@ class Granter:
             if not other.silent and set(other.record.places) & set(entry.places):
                 return f"'{other.record.arm}' is at the same station with '{other.record.job}'"
         return "the shift is over" if book.ended else ""
+
+    def _denied(self, arm: str, entry: ClaimEntry, reason: str) -> DeniedEntry:
+        """Return a denial, with what the arm may not know: the outcome of the job, or another arm that may commit."""
+        outcome, job = self.known_outcome(entry.job), self.book.jobs.get(entry.job)
+        if outcome is not None or job is None or job.arm == arm:
+            return DeniedEntry(entry.award, reason, outcome)
+        return DeniedEntry(entry.award, reason, None, committed_job(self.arm, job, self.book.time_s))
 
     def _grant(self, claim: Claim, entry: ClaimEntry, real_s: float) -> str:
         """Grant a job, or extend its grant; return why it could not be written to disk, or ""."""
@@ -432,6 +449,8 @@ class Claimant:
         for denied in reply.denied:
             if denied.outcome is not None:
                 self._apply_outcome(denied.outcome)
+            if denied.committed is not None and denied.award in self.pending:
+                self._adopt_commit(reply.arm, denied.award, denied.committed, real_s)
             vote = self._votes.get(denied.award)
             if vote is not None and asked_s >= vote.granted_s.get(reply.arm, -math.inf):
                 vote.granted_s.pop(reply.arm, None)
@@ -533,6 +552,21 @@ class Claimant:
         """Withdraw a request; peers learn of it with the next claim."""
         self.rejected.append(self.pending.pop(award).job.name)
         self._change()
+
+    def _adopt_commit(self, peer: str, award: str, committed: JobOutcome, real_s: float) -> None:
+        """Withdraw a request for a job that another arm may finish, as a peer knows, and record the grant of that arm.
+
+        Else this arm would request the job for ever, and nobody could settle it here.
+        """
+        entry = self.granter.book.jobs.get(committed.job)
+        grant = None if entry is None else entry.grant
+        if grant is not None and grant.record.award != award:  # a lease that was granted here has to end first
+            return
+        try:
+            self.granter.adopt(adopted(self.granter.book, History(peer, committed=(committed,))), real_s)
+        except JournalError as error:
+            _LOG.error("Could not persist the grant of '%s' to '%s': %s", committed.job, committed.arm, error)
+        self._reject(award)
 
     def _expire(self, real_s: float) -> None:
         """Withdraw requests that are not granted in time, drop unneeded votes, and mark new reports."""
