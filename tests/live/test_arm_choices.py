@@ -4,6 +4,7 @@ import random
 import re
 from contextlib import nullcontext
 from copy import deepcopy
+from dataclasses import replace
 from functools import partial
 from itertools import islice
 
@@ -350,3 +351,21 @@ def test_a_job_lost_in_its_last_cycle_is_settled_at_an_arm_that_was_cut_off_mean
     fleet.control(Settle("a", outcome))
     fleet.until(lambda: fleet.is_everywhere("a", "finished"))
     assert fleet.begun == ({} if outcome == "done" else {"a": 1})
+
+
+@pytest.mark.parametrize("compacted", [False, True])
+def test_an_arm_does_not_start_with_journals_of_a_fleet_of_other_arms(fleet_of, compacted):
+    """A majority of five arms may have no arm in common with a majority of the three before."""
+    fleet = fleet_of(True, trace=True)
+    fleet.submit(*(job(f"job {number}", 2, value=1.0) for number in range(20 if compacted else 1)))
+    fleet.until(lambda: fleet.is_everywhere("job 0", "finished"))
+    builder, process = fleet.builders["arm_0"], fleet.world.processes["arm_0"]
+    three = builder._membership
+    builder._membership = replace(three, fleet=replace(three.fleet, arms=(*fleet.arms, "arm_3", "arm_4")))
+    fleet.restart("arm_0")
+    assert not process.up
+    (line,) = fleet.logged("exits")
+    assert "are of a fleet of the arms arm_0, arm_1, arm_2, not of arm_0, arm_1, arm_2, arm_3, arm_4" in line
+    builder._membership = three
+    process.start()
+    fleet.until(lambda: begun(fleet, "arm_0"))

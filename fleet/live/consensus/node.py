@@ -20,7 +20,7 @@ from fleet.bus.protocol.auction import JobStatus, LeaseRequest, Report, Submissi
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply, History, HistoryRequest
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
-from fleet.errors import BusError, JournalFull, Refused
+from fleet.errors import BusError, JournalFull, Refused, listed
 from fleet.live.arm.node import ArmNode
 from fleet.live.book import JobBook
 from fleet.live.clock import FleetClock
@@ -76,7 +76,8 @@ class ConsensusNode(JobDesk):
             new_epoch: Begin even if peers know claims of this arm that its journals do not.
 
         Raises:
-            BusError: peers know another epoch, or claims of this arm after those in its journals.
+            BusError: peers know another epoch, or claims of this arm after those in its journals; or the journals are
+                of a fleet of other arms.
             JournalError: the journal is of another arm.
         """
         super().__init__(arm.executor.arm, arm.clock.speed, membership.cell)
@@ -87,6 +88,11 @@ class ConsensusNode(JobDesk):
         real_s = time.monotonic()
         self._recorder = TimeRecorder(journal, book, real_s)
         roster = membership.fleet.arms
+        if book.roster not in ((), tuple(sorted(roster))):
+            raise BusError(
+                f"The journals of '{self._name}' are of a fleet of the arms {listed(book.roster)}, not of "
+                f"{listed(sorted(roster))}: jobs could be done twice. Restore the scenario, or begin in another folder."
+            )
         timing, excludes = membership.timing, membership.excludes
         granter = Granter(self._name, roster, book, journal.append, real_s=real_s, timing=timing, excludes=excludes)
         self._first_number, self._new_epoch = first_number(self._name, boot, book), new_epoch
@@ -283,9 +289,10 @@ class ConsensusNode(JobDesk):
 
     def _take_epoch(self, epoch: str) -> bool:
         """Take the epoch of the fleet, unless there is one on disk already; return whether it is this one."""
-        if epoch and not self._epoch:
+        if epoch and not (self._epoch and self.book.roster):
             try:
-                self.book.record(EpochBegun(epoch))
+                roster = tuple(sorted(self.participant.granter.roster))
+                self.book.record(EpochBegun(self._epoch or epoch, roster=roster))
             except Refused as error:
                 self._warn("epoch", f"cannot record the epoch: {error}")
         elif epoch not in ("", self._epoch):
