@@ -369,3 +369,19 @@ def test_an_arm_does_not_start_with_journals_of_a_fleet_of_other_arms(fleet_of, 
     builder._membership = three
     process.start()
     fleet.until(lambda: begun(fleet, "arm_0"))
+
+
+def test_without_a_majority_no_job_is_accepted(fleet_of):
+    """Both sides of a cut could accept a job of one name, and only one of these would be done."""
+    fleet = fleet_of(True)
+    fleet.world.split({"arm_2": 1, CLIENT: 1})
+    fleet.run(12.0)
+    here, there = (job("a", 2, place=place, release_s=1000.0) for place in ("here", "there"))
+    reason = "A majority of the arms, 2, must be present. Submit it again then."
+    assert refused(lambda: fleet.submit(here)) == reason
+    assert fleet.known() == [{}, {}, {}]
+    fleet.world.split({"arm_2": 1})
+    assert fleet.submit(there)[0].accepted
+    fleet.cut()
+    fleet.until(lambda: fleet.is_everywhere("a", "waiting"))
+    assert not fleet.submit(here)[0].accepted

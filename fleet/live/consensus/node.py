@@ -20,12 +20,12 @@ from fleet.bus.protocol.auction import JobStatus, LeaseRequest, Report, Submissi
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply, History, HistoryRequest
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
-from fleet.errors import BusError, JournalFull, Refused, listed
+from fleet.errors import BusError, JournalFull, Refused, RefusedForNow, listed
 from fleet.live.arm.node import ArmNode
 from fleet.live.book import JobBook
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Granter
-from fleet.live.consensus.participant import Membership, Participant
+from fleet.live.consensus.participant import TOO_FEW, Membership, Participant
 from fleet.live.desk import JobDesk
 from fleet.live.epochs import REPLY_S, adopted, ask_arms, check_journals, history_of
 from fleet.live.job_rules import SHIFT_ENDED
@@ -318,10 +318,15 @@ class ConsensusNode(JobDesk):
         Raises:
             AnotherReplies: another arm does.
         """
-        # The bid of a peer may begin the fleet's time here before the tokens arrive.
-        present = self._tokens | (self._at_start if time.monotonic() < self._listened_s else frozenset[str]())
-        if not self._begun or self._name != min(present & self.participant.granter.roster, default=self._name):
+        if not self._begun or self._name != min(self._present, default=self._name):
             raise AnotherReplies
+
+    @property
+    def _present(self) -> frozenset[str]:
+        """Present arms of the roster."""
+        # The bid of a peer may begin the fleet's time here before the tokens arrive.
+        at_start = self._at_start if time.monotonic() < self._listened_s else frozenset[str]()
+        return self.participant.granter.roster & (self._tokens | at_start)
 
     @property
     def time_s(self) -> float:
@@ -339,6 +344,9 @@ class ConsensusNode(JobDesk):
         return self.participant.status_of(entries, time.monotonic())
 
     def _submit(self, submission: Submission) -> SubmissionReply:
+        if len(self._present | {self._name}) < self._majority:  # the others may accept another job of the same name
+            self._check_first()
+            raise RefusedForNow(f"{TOO_FEW.format(self._majority)} Submit it again then.")
         later = {job.name: job for _, job in self._stream}
         admissions = self.book.admit(submission.jobs, self.time_s, later)
         accepted = [job for job, reply in zip(submission.jobs, admissions, strict=True) if reply.accepted]
