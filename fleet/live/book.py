@@ -11,7 +11,8 @@ roster (`fleet.live.consensus.grants`). The rules that make it safe (`fleet.bus.
   (`expire`), or its arm has refused, released or returned it.
 - While a job is granted, no other job at one of its stations is.
 - Permission to commit, that is to begin the last cycle, is durable before it is given. It stays unless the arm releases
-  or returns the job; no other arm gets the job then.
+  or returns the job; no other arm gets the job then. An arm without an auctioneer that lost its journal of awards
+  reports such a job as unfinished, by its own grants or those of its peers.
 - A settled job is granted to no arm, a cancelled one only to the arm that has permission to commit.
 - After a crash every open grant counts as leased from the restart.
 - A grant without permission to commit also ends when an arm has finished the job, or, if an older copy of the journal

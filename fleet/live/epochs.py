@@ -6,7 +6,8 @@ was lost: no jobs are accepted, unless a new epoch was requested. Then the aucti
 
 Without an auctioneer all arms keep one epoch. An arm whose journals are lost has forgotten what it granted and what was
 done: it does not take part beside arms that know it, unless a person requests it (`--new-epoch`). Then it adopts what
-the present arms have done and have.
+the present arms have done and have. An arm takes part only after a majority, with itself, has replied with its history.
+Peers record the first claim of each start of an arm: a copy from before its last start is noticed, a later one is not.
 """
 
 from collections.abc import Iterable

@@ -128,7 +128,7 @@ class DeniedEntry(msgspec.Struct, frozen=True):
     outcome: JobOutcome | None = None
     """Its outcome, if it has one."""
     committed: JobOutcome | None = None
-    """Without one: the award of another arm with permission to commit, as in `History`. The claimer records it."""
+    """As in `History`; the claimer records it."""
 
 
 class ClaimReply(msgspec.Struct, frozen=True):
