@@ -385,3 +385,17 @@ def test_without_a_majority_no_job_is_accepted(fleet_of):
     fleet.cut()
     fleet.until(lambda: fleet.is_everywhere("a", "waiting"))
     assert not fleet.submit(here)[0].accepted
+
+
+def test_an_arm_that_restarts_without_a_majority_replies_to_clients_and_neither_claims_nor_grants(fleet_of):
+    fleet = fleet_of(True, 5)
+    fleet.submit(job("a", 1, release_s=1000.0))
+    for arm in fleet.arms[2:]:
+        fleet.world.processes[arm].kill("is killed")
+    fleet.run(12.0)
+    fleet.restart("arm_0")
+    fleet.run(5.0)
+    assert fleet.status("a").state == "waiting"
+    assert not fleet.node("arm_0").work_source.participant.claimant._sent
+    fleet.world.processes["arm_2"].start()
+    fleet.until(lambda: bool(fleet.node("arm_0").work_source.participant.claimant._sent))

@@ -180,7 +180,7 @@ class ConsensusNode(JobDesk):
         self._joined = len({each.arm for each in histories} | {self._name}) >= self._majority
 
     def _ask_peers(self, real_s: float) -> None:
-        """Ask all peers what they know, before this arm takes part."""
+        """Ask all peers what they know, before this arm takes or names an epoch, claims or grants."""
         if real_s < self._asked_s + REPLY_S:
             return
         self._asked_s = real_s
@@ -211,7 +211,10 @@ class ConsensusNode(JobDesk):
             if time_s >= self._membership.horizon_s and math.isinf(self._ended_s):
                 self._end(real_s, time_s)
             self.participant.set_present(frozenset(self._tokens))
-            self.participant.tick(real_s, time_s)
+            if self._joined:  # else its journals may be an older copy: it claims and grants nothing
+                self.participant.tick(real_s, time_s)
+            else:
+                self._ask_peers(real_s)
             self._send()
             self._recorder.step(real_s, time_s)
         self.wake_s = self.participant.wake_s(real_s)
@@ -231,10 +234,10 @@ class ConsensusNode(JobDesk):
         roster = self.participant.granter.roster
         present = len(self._tokens & roster | {self._name})
         if present < self._majority:
-            self._since_s, self._joined = real_s, self._joined and self._epoch != ""  # the others may begin one
+            self._since_s, self._joined = real_s, False  # meanwhile the others may begin an epoch
         elif real_s - self._since_s >= (LISTEN_S if present == len(roster) else PATIENCE_S):
             first = self._name == min(self._tokens & roster | {self._name})
-            if not self._joined:
+            if not (self._epoch or self._joined):
                 self._ask_peers(real_s)
                 return
             if not (self._epoch or first):  # the first by name names the epoch; its bid begins the fleet's time here
@@ -270,7 +273,7 @@ class ConsensusNode(JobDesk):
         real_s = time.monotonic()
         if arm == self._name or arm not in self.participant.granter.roster:
             return
-        if not (self._begun or self._joined):
+        if bid.epoch and not (self._epoch or self._joined):
             self._ask_peers(real_s)
             return
         if not self._take_epoch(bid.epoch) and not self._begun:
@@ -306,7 +309,7 @@ class ConsensusNode(JobDesk):
         (self._tokens.add if present else self._tokens.discard)(arm)
 
     def _answer_claim(self, claim: Claim) -> ClaimReply:
-        if claim.arm == self._name or not self._begun:
+        if claim.arm == self._name or not (self._begun and self._joined):
             raise AnotherReplies
         return self.participant.granter.answer_claim(claim, time.monotonic())
 
