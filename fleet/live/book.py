@@ -11,7 +11,8 @@ roster (`fleet.live.consensus.grants`). The rules that make it safe (`fleet.bus.
   (`expire`), or its arm has refused, released or returned it.
 - While a job is granted, no other job at one of its stations is.
 - Permission to commit, that is to begin the last cycle, is durable before it is given. It stays unless the arm releases
-  or returns the job; no other arm gets the job then.
+  or returns the job; no other arm gets the job then. An arm without an auctioneer that lost its journal of awards
+  reports such a job as unfinished, by its own grants or those of its peers.
 - A settled job is granted to no arm, a cancelled one only to the arm that has permission to commit.
 - After a crash every open grant counts as leased from the restart.
 - A grant without permission to commit also ends when an arm has finished the job, or, if an older copy of the journal
@@ -112,7 +113,7 @@ MAX_UNKNOWN = 4 * MAX_OPEN_JOBS
 """Jobs of which only the name is known, from peers; the first ones leave if there are more."""
 MAX_ENDED = 16
 """Ended awards of one job on which a report is still expected."""
-PLAIN = ("time_s", "number", "ended", "epoch", "succeeds", "operated")
+PLAIN = ("time_s", "number", "ended", "epoch", "succeeds", "operated", "roster")
 """Fields of a book that its snapshot holds as they are."""
 
 
@@ -151,6 +152,8 @@ class JobBook(TimedState[BookRecord]):
     """Of the journal; another one begins when the journal is lost. "" before the first start."""
     succeeds: bool = False
     """A person has requested that the epoch takes the place of another one."""
+    roster: tuple[str, ...] = ()
+    """All arms among which a majority was counted in this epoch; empty with an auctioneer."""
     time_s: float = 0.0
     """Latest time of all records."""
     number: int = 0
@@ -466,6 +469,7 @@ class JobBook(TimedState[BookRecord]):
                 changed = self._clear(arm, by)
             case EpochBegun():
                 self.epoch, self.succeeds = record.epoch, record.succeeds
+                self.roster = record.roster or self.roster
             case ClaimNumbered(arm, number):
                 self.numbers[arm] = max(number, self.numbers.get(arm, -1))
             case BookSnapshot():

@@ -6,7 +6,8 @@ was lost: no jobs are accepted, unless a new epoch was requested. Then the aucti
 
 Without an auctioneer all arms keep one epoch. An arm whose journals are lost has forgotten what it granted and what was
 done: it does not take part beside arms that know it, unless a person requests it (`--new-epoch`). Then it adopts what
-the present arms have done and have.
+the present arms have done and have. An arm takes part only after a majority, with itself, has replied with its history.
+Peers record the first claim of each start of an arm: a copy from before its last start is noticed, a later one is not.
 """
 
 from collections.abc import Iterable
@@ -20,7 +21,7 @@ from fleet.errors import BusError
 from fleet.live.book import JobBook
 from fleet.live.job_rules import is_same_work
 from fleet.live.journal import CommitPermitted, EpochBegun, JobsAccepted
-from fleet.live.records import BookRecord, ClaimNumbered, Granted, HistoryAdopted, JobSettled
+from fleet.live.records import BookRecord, ClaimNumbered, Granted, HistoryAdopted, JobEntry, JobSettled
 
 REPLY_S = 1.0
 """Real seconds that an arm has to reply."""
@@ -95,15 +96,19 @@ def check_journals(arm: str, number: int, epoch: str, histories: Iterable[Histor
 
 def history_of(arm: str, book: JobBook) -> History:
     """Return the jobs that finished last, and those with permission to commit, as many as one message holds."""
-    reason = f"The journals of its arm were lost; '{arm}' had granted it permission to commit."
-    committed = tuple(
-        JobOutcome(entry.name, entry.award, grant.record.arm, "unfinished", entry.cycles, book.time_s, reason)
-        for entry in book.jobs.values()
-        if (grant := entry.grant) is not None and grant.may_commit
-    )[:MOST_JOBS]
+    committed = [each for entry in book.jobs.values() if (each := committed_job(arm, entry, book.time_s)) is not None]
     entries = (book.jobs[name] for _, name in book.settled if book.is_finished(name))
     jobs = [job for entry in entries if (job := entry.original) is not None]
-    return with_finished(History(arm, book.epoch, (), claims=dict(book.numbers), committed=committed), jobs)
+    history = History(arm, book.epoch, (), claims=dict(book.numbers), committed=tuple(committed[:MOST_JOBS]))
+    return with_finished(history, jobs)
+
+
+def committed_job(granter: str, entry: JobEntry, time_s: float) -> JobOutcome | None:
+    """Return a job with permission to commit as what it becomes if its arm has lost it; None without permission."""
+    if (grant := entry.grant) is None or not grant.may_commit:
+        return None
+    reason = f"The journals of its arm were lost; '{granter}' had granted it permission to commit."
+    return JobOutcome(entry.name, entry.award, grant.record.arm, "unfinished", entry.cycles, time_s, reason)
 
 
 def adopted(book: JobBook, history: History) -> list[BookRecord]:
@@ -142,6 +147,10 @@ def adopted(book: JobBook, history: History) -> list[BookRecord]:
         entry = book.jobs.get(outcome.job)
         grant = None if entry is None else entry.grant
         if book.is_settled(outcome.job) or (grant is not None and grant.may_commit):
+            continue
+        before = book.grant_of(outcome.award, outcome.job)
+        is_over = before is not None and before.outcome not in ("", "dropped")  # its arm has reported or released it
+        if is_over or outcome.award in book.operations.redone(outcome.job):
             continue
         if outcome.arm == book.name:  # it may have done the last cycle, and does not know
             records.append(JobSettled(outcome))

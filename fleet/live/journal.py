@@ -308,6 +308,8 @@ class EpochBegun(msgspec.Struct, frozen=True, tag="epoch_begun"):
     time_s: float = 0.0
     succeeds: bool = False
     """An operator has requested that it replaces another one: arms may have older epochs."""
+    roster: tuple[str, ...] = ()
+    """All arms of a fleet without an auctioneer, sorted; empty with one."""
 
 
 class ClockTick(msgspec.Struct, frozen=True, tag="clock_tick"):

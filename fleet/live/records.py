@@ -247,6 +247,7 @@ class BookSnapshot(msgspec.Struct, frozen=True, tag="book_snapshot"):
     operations: tuple[Operation, ...]
     operated: int
     requested: tuple[Operation, ...]
+    roster: tuple[str, ...] = ()
 
 
 BookRecord = (

@@ -3,6 +3,8 @@
 import random
 import re
 from contextlib import nullcontext
+from copy import deepcopy
+from dataclasses import replace
 from functools import partial
 from itertools import islice
 
@@ -18,10 +20,11 @@ from benchmarks.simulation.simulated_fleet import FIRST
 from fleet.bus.client import AnotherReplies
 from fleet.bus.protocol.auction import Ack, Award
 from fleet.bus.protocol.keys import of_arm
+from fleet.bus.protocol.operator import Settle
 from fleet.errors import BusError
 from fleet.live.consensus.node import ConsensusNode
 from scenarios.live.arm import refuse_auctioneer
-from tests.live.simulated import SPEED, SimulatedFleet, job, refused
+from tests.live.simulated import LONG, SPEED, SimulatedFleet, job, refused
 from tests.profiles import examples
 
 ARM_POLICIES = [name for name, rule in RULES.items() if rule.scope == "arm"]
@@ -232,3 +235,167 @@ def test_an_arm_that_lost_its_journals_does_not_join_unless_a_person_requests_it
     fleet.submit(job("d", 2))
     fleet.until(lambda: fleet.is_everywhere("d", "finished"))
     assert fleet.finished == dict.fromkeys("abcd", 1)
+
+
+# Journals that are lost or older, and the last cycle
+
+
+def lose_files(fleet: SimulatedFleet, arm: str, prefix: str = "") -> None:
+    """Remove the files of a killed arm whose names begin so; its events begin their numbers again."""
+    disk = fleet.world.processes[arm].disk
+    disk.names = {name: file for name, file in disk.names.items() if not name.startswith(prefix)}
+    disk._durable = dict(disk.names)
+    fleet.world.bus.on_publish = lambda *_: None
+
+
+def killed_in_last_cycle(fleet: SimulatedFleet) -> str:
+    """Return the arm that was killed in the last cycle of job a, which this submits."""
+    fleet.submit(job("a", 1, **LONG))
+    return killed(fleet)
+
+
+def killed(fleet: SimulatedFleet) -> str:
+    """Return the arm that was killed in the last cycle of the only job."""
+    fleet.until(lambda: bool(fleet.begun))
+    (arm,) = fleet.away
+    fleet.world.processes[arm].kill("is killed")
+    return arm
+
+
+@pytest.mark.parametrize("absent_s", [0.0, 6.0])
+def test_a_last_cycle_is_not_begun_again_if_its_arm_lost_only_its_awards(fleet_of, absent_s):
+    fleet = fleet_of(True)
+    arm = killed_in_last_cycle(fleet)
+    lose_files(fleet, arm, "awards")
+    fleet.run(absent_s)
+    fleet.world.processes[arm].start()
+    fleet.run(30.0)
+    assert (fleet.begun, fleet.states("a")) == ({"a": 1}, {"unfinished"})
+
+
+@pytest.mark.parametrize("next_fault", ["none", "crash", "cut"])
+@pytest.mark.parametrize("absent_s", [0.0, 6.0])
+def test_a_last_cycle_is_not_begun_again_if_its_arm_lost_all_journals(fleet_of, absent_s, next_fault):
+    """Also if its second claim after the start with `new_epoch` reaches nobody."""
+    fleet = fleet_of(True)
+    arm = killed_in_last_cycle(fleet)
+    lose_files(fleet, arm)
+    fleet.run(absent_s)
+    fleet.builders[arm].new_epoch = True
+    fleet.world.processes[arm].start()
+
+    def claims():
+        return fleet.node(arm) and fleet.node(arm).work_source.participant.claimant._sent
+
+    assert fleet.world.run(fleet.world.now_s + 10.0, claims)
+    if next_fault == "crash":
+        fleet.world.processes[arm].kill("is killed again")
+    elif next_fault == "cut":
+        fleet.world.after(0.001, fleet.cut, arm)
+    fleet.run(30.0)
+    assert (fleet.begun, fleet.states("a")) == ({"a": 1}, {"unfinished"})
+
+
+@pytest.mark.parametrize("witness_first", [True, False])
+def test_a_restored_copy_of_a_granter_from_before_its_last_start_is_noticed(fleet_of, witness_first):
+    """By the peer that has forgotten all but the first claim of that start."""
+    fleet = fleet_of(True, trace=True)
+    processes = fleet.world.processes
+    fleet.submit(job("a", 1, release_s=100.0, **LONG))
+    fleet.run(3.0)
+    *others, witness = fleet.arms
+    for arm in others:
+        processes[arm].kill("is stopped")
+    copies = {arm: deepcopy(processes[arm].disk.names) for arm in others}
+    for arm in others:
+        processes[arm].start()
+    fleet.run(2.0)
+    processes[witness].kill("is killed")
+    fleet.until(lambda: bool(fleet.begun))
+    (holder,) = fleet.away
+    (granter,) = {*others} - {holder}
+    fleet.cut(holder)
+    processes[granter].kill("is killed")
+    disk = processes[granter].disk
+    disk.names, disk._durable = copies[granter], dict(copies[granter])
+    fleet.run(8.0)
+    for arm in (witness, granter) if witness_first else (granter, witness):
+        processes[arm].start()
+        fleet.run(3.0)
+    fleet.run(40.0)
+    assert fleet.logged("'arm_2' knows claims of")
+    assert (processes[granter].up, fleet.begun) == (False, {"a": 1})
+
+
+@pytest.mark.parametrize("outcome", ["done", "redo"])
+@pytest.mark.parametrize("cleared", ["never", "before", "after"])
+def test_a_job_lost_in_its_last_cycle_is_settled_at_an_arm_that_was_cut_off_meanwhile(fleet_of, cleared, outcome):
+    """At first that arm requests the job itself; its peer names the arm that has permission to commit."""
+    fleet = fleet_of(True)
+    fleet.submit(job("a", 1, release_s=80.0, **LONG))
+    fleet.run(3.0)
+    fleet.cut("arm_0")
+    arm = killed(fleet)
+    fleet.move_home(arm)
+    fleet.run(8.0)
+    if cleared == "before":
+        fleet.free_space(arm)
+    fleet.cut()
+    fleet.run(20.0)
+    assert fleet.is_everywhere("a", "unfinished")
+    if cleared != "after" and outcome == "redo":
+        assert "may still do the last cycle" in refused(lambda: fleet.control(Settle("a", outcome)))
+    if cleared == "after" or outcome == "redo":
+        fleet.free_space(arm)
+    fleet.begun.clear()
+    fleet.control(Settle("a", outcome))
+    fleet.until(lambda: fleet.is_everywhere("a", "finished"))
+    assert fleet.begun == ({} if outcome == "done" else {"a": 1})
+
+
+@pytest.mark.parametrize("compacted", [False, True])
+def test_an_arm_does_not_start_with_journals_of_a_fleet_of_other_arms(fleet_of, compacted):
+    """A majority of five arms may have no arm in common with a majority of the three before."""
+    fleet = fleet_of(True, trace=True)
+    fleet.submit(*(job(f"job {number}", 2, value=1.0) for number in range(20 if compacted else 1)))
+    fleet.until(lambda: fleet.is_everywhere("job 0", "finished"))
+    builder, process = fleet.builders["arm_0"], fleet.world.processes["arm_0"]
+    three = builder._membership
+    builder._membership = replace(three, fleet=replace(three.fleet, arms=(*fleet.arms, "arm_3", "arm_4")))
+    fleet.restart("arm_0")
+    assert not process.up
+    (line,) = fleet.logged("exits")
+    assert "are of a fleet of the arms arm_0, arm_1, arm_2, not of arm_0, arm_1, arm_2, arm_3, arm_4" in line
+    builder._membership = three
+    process.start()
+    fleet.until(lambda: begun(fleet, "arm_0"))
+
+
+def test_without_a_majority_no_job_is_accepted(fleet_of):
+    """Both sides of a cut could accept a job of one name, and only one of these would be done."""
+    fleet = fleet_of(True)
+    fleet.world.split({"arm_2": 1, CLIENT: 1})
+    fleet.run(12.0)
+    here, there = (job("a", 2, place=place, release_s=1000.0) for place in ("here", "there"))
+    reason = "A majority of the arms, 2, must be present. Submit it again then."
+    assert refused(lambda: fleet.submit(here)) == reason
+    assert fleet.known() == [{}, {}, {}]
+    fleet.world.split({"arm_2": 1})
+    assert fleet.submit(there)[0].accepted
+    fleet.cut()
+    fleet.until(lambda: fleet.is_everywhere("a", "waiting"))
+    assert not fleet.submit(here)[0].accepted
+
+
+def test_an_arm_that_restarts_without_a_majority_replies_to_clients_and_neither_claims_nor_grants(fleet_of):
+    fleet = fleet_of(True, 5)
+    fleet.submit(job("a", 1, release_s=1000.0))
+    for arm in fleet.arms[2:]:
+        fleet.world.processes[arm].kill("is killed")
+    fleet.run(12.0)
+    fleet.restart("arm_0")
+    fleet.run(5.0)
+    assert fleet.status("a").state == "waiting"
+    assert not fleet.node("arm_0").work_source.participant.claimant._sent
+    fleet.world.processes["arm_2"].start()
+    fleet.until(lambda: bool(fleet.node("arm_0").work_source.participant.claimant._sent))

@@ -13,15 +13,15 @@ from hypothesis import strategies as st
 from fleet.bus.protocol.auction import MOST_JOBS, Award, JobSpec, Quote, Submission
 from fleet.bus.protocol.consensus import History, JobOutcome
 from fleet.bus.protocol.messages import MOST_BYTES, MalformedMessage, decode, encode
-from fleet.bus.protocol.operator import Cancel, ClearRequest, ControlRequest
+from fleet.bus.protocol.operator import Cancel, ClearRequest, ControlRequest, Operation, Settle
 from fleet.job import reason_to_give_up
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.rounds import Round, closed_space, stated_spaces
 from fleet.live.book import JobBook
 from fleet.live.epochs import adopted
 from fleet.live.job_rules import PastJobs, admit
-from fleet.live.journal import ClockTick, CommitPermitted, JobsAccepted, SpaceTaken
-from fleet.live.records import BookRecord, ContactLost, ContactRegained, Granted, ShiftEnded
+from fleet.live.journal import ClockTick, CommitPermitted, JobsAccepted, Released, SpaceTaken
+from fleet.live.records import BookRecord, ContactLost, ContactRegained, Granted, JobSettled, Requested, ShiftEnded
 from tests.live.records import awarded, closed
 from tests.profiles import examples
 
@@ -234,6 +234,20 @@ def test_an_older_copy_without_an_auctioneer_learns_of_permission_to_commit(numb
     assert (grant is not None and grant.may_commit) == (state == "finishing") == bool(book.open)
     assert book.numbers == ({arm: 5} if state == "finishing" else {})
     assert adopted(book, history) == []
+
+
+def test_permission_to_commit_that_has_ended_here_is_not_adopted_from_a_peer():
+    """By the report of the arm, or by a person who has its job redone; an ended lease is no such end."""
+    history = History("arm_3", committed=(JobOutcome("a", "0:a", "arm_1", "unfinished", 2, 0.0),))
+    granted = [JobsAccepted((spec("a"),), "test", 0.0), award("a", arm="arm_1")]
+    redo = Operation("arm_2", 5.0, ControlRequest("redo", Settle("a", "redo"), "ann"), awards=("0:a",))
+    lease_ended, returned = (
+        Released("0:a", "a", "arm_1", "dropped"),
+        JobOutcome("a", "0:a", "arm_1", "returned", 1, 2.0),
+    )
+    for end, is_adopted in ((lease_ended, True), (JobSettled(returned), False), (Requested(redo), False)):
+        book = JobBook(name="arm_0", is_central=False).replay([*granted, end])
+        assert bool(adopted(book, history)) == is_adopted
 
 
 @pytest.mark.parametrize("before", [False, True])

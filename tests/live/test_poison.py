@@ -338,7 +338,7 @@ def test_no_message_stops_an_arm_without_an_auctioneer(node, data):
         participant.claimant._number + 1,
         3.0,
         (GrantedEntry(award, 1, True, {"w": "arm_1"}),),
-        (DeniedEntry("w", "no", finished),),
+        (DeniedEntry("w", "no", finished), DeniedEntry(award, "no", None, replace(finished, outcome="unfinished"))),
     )
     history = History("arm_1", "e", (JOB,), claims={"arm_1": 1}, committed=(replace(finished, outcome="unfinished"),))
     for answer, message in ((ClaimReply, reply), (History, history)):

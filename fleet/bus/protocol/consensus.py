@@ -127,6 +127,8 @@ class DeniedEntry(msgspec.Struct, frozen=True):
     reason: str
     outcome: JobOutcome | None = None
     """Its outcome, if it has one."""
+    committed: JobOutcome | None = None
+    """As in `History`; the claimer records it."""
 
 
 class ClaimReply(msgspec.Struct, frozen=True):

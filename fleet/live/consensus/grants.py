@@ -5,23 +5,34 @@ The rules that make grants safe are at the head of `fleet.live.book`; the quorum
 To the arm's `AwardExecutor` its `Claimant` acts as an auctioneer: a job that a majority grants is an award, its lease
 counts from the moment of the query to the last arm of a majority, and an outcome that a majority has on disk is
 receipted. Every claim lists all jobs that the arm has, requests and reports: a peer that misses a job there that it has
-granted knows that the arm has released it.
+granted knows that the arm has released it. A claim therefore also reports the jobs for which the arm had permission to
+commit, by its own grants, and which its journal of awards lacks: until a majority has them as unfinished.
 """
 
 import logging
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass, field
 
 from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import MOST_JOBS, Ack, Award, JobSpec, Lease, Receipt
-from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, DeniedEntry, Faults, GrantedEntry, JobOutcome
+from fleet.bus.protocol.consensus import (
+    Claim,
+    ClaimEntry,
+    ClaimReply,
+    DeniedEntry,
+    Faults,
+    GrantedEntry,
+    History,
+    JobOutcome,
+)
 from fleet.bus.protocol.operator import ALL_ARMS, Operation, Pause, Resume
 from fleet.errors import JournalError, JournalFull, Refused
 from fleet.job import reason_to_give_up
 from fleet.live.arm.awards import REVOKED, ActiveAward, AwardExecutor
 from fleet.live.book import MAX_SETTLED, JobBook
+from fleet.live.epochs import adopted, committed_job
 from fleet.live.job_rules import MAX_OPEN_JOBS
 from fleet.live.journal import JobsAccepted, Progress, Released, SpaceTaken
 from fleet.live.leases import Timing, clear, expire, renewal
@@ -84,6 +95,8 @@ class Granter:
         last = book.numbers.get(claim.arm, -1)
         if claim.number <= last:
             raise Refused(f"Stale claim {claim.number} from '{claim.arm}' (latest {last}).")
+        if claim.number // NUMBERS_PER_BOOT > last // NUMBERS_PER_BOOT:  # by it, that arm notices an older copy
+            book.record(ClaimNumbered(claim.arm, claim.number))
         self.add_jobs(claim.jobs)
         for outcome in claim.outcomes:
             self.apply_outcome(outcome)
@@ -100,7 +113,7 @@ class Granter:
         denied: list[DeniedEntry] = []
         for entry in claim.entries:
             if reason := self._objection(claim.arm, entry, real_s) or self._grant(claim, entry, real_s):
-                denied.append(DeniedEntry(entry.award, reason, self.known_outcome(entry.job)))
+                denied.append(self._denied(claim.arm, entry, reason))
             else:
                 job = book.jobs[entry.job]
                 may_commit = job.grant is not None and job.grant.may_commit
@@ -216,6 +229,13 @@ class Granter:
                 return f"'{other.record.arm}' is at the same station with '{other.record.job}'"
         return "the shift is over" if book.ended else ""
 
+    def _denied(self, arm: str, entry: ClaimEntry, reason: str) -> DeniedEntry:
+        """Return a denial, with what the arm may not know: the outcome of the job, or another arm that may commit."""
+        outcome, job = self.known_outcome(entry.job), self.book.jobs.get(entry.job)
+        if outcome is not None or job is None or job.arm == arm:
+            return DeniedEntry(entry.award, reason, outcome)
+        return DeniedEntry(entry.award, reason, None, committed_job(self.arm, job, self.book.time_s))
+
     def _grant(self, claim: Claim, entry: ClaimEntry, real_s: float) -> str:
         """Grant a job, or extend its grant; return why it could not be written to disk, or ""."""
         book, job = self.book, self.book.jobs.get(entry.job)
@@ -250,6 +270,8 @@ CLAIM_S = 0.5
 """Real seconds after which a claim is repeated for peers that have not replied."""
 PENDING_S = 2.0
 """Real seconds after which an arm withdraws a request that no majority grants."""
+LOST = "The journal of its arm was lost after it had permission to commit."
+"""Why a job is unfinished of which the arm itself has no record."""
 MAX_CORRECTIONS = 32
 """In one claim."""
 MAX_CLAIMS = 64
@@ -427,6 +449,8 @@ class Claimant:
         for denied in reply.denied:
             if denied.outcome is not None:
                 self._apply_outcome(denied.outcome)
+            if denied.committed is not None and denied.award in self.pending:
+                self._adopt_commit(reply.arm, denied.award, denied.committed, real_s)
             vote = self._votes.get(denied.award)
             if vote is not None and asked_s >= vote.granted_s.get(reply.arm, -math.inf):
                 vote.granted_s.pop(reply.arm, None)
@@ -463,7 +487,22 @@ class Claimant:
                 phase = "finishing" if last.phase == "finishing" else "working"
                 entries.append(replace(last, cycles=report.cycles, phase=phase))
         self._last_entries = {entry.award: entry for entry in entries}
-        return entries, outcomes
+        outcomes += self._lost_jobs({*self._last_entries, *(outcome.award for outcome in outcomes)})
+        return entries, outcomes[:MOST_JOBS]
+
+    def _lost_jobs(self, claimed: Container[str]) -> list[JobOutcome]:
+        """Return unfinished jobs of this arm that it neither has nor reports, and that no majority is known to have."""
+        lost: list[JobOutcome] = []
+        for entry in self.granter.book.jobs.values():
+            outcome, grant = entry.outcome, entry.grant
+            if grant is not None and grant.may_commit and grant.record.arm == self.arm:
+                terms = (grant.record.award, self.arm, "unfinished", entry.cycles, self.granter.book.time_s, LOST)
+                outcome = JobOutcome(entry.name, *terms)
+            if outcome is None or (outcome.outcome, outcome.arm) != ("unfinished", self.arm):
+                continue
+            if outcome.award not in claimed and len(self._receipts.setdefault(outcome.award, set())) < self.majority:
+                lost.append(outcome)
+        return lost
 
     def _count_votes(self, real_s: float) -> None:
         """Act on the replies of a majority."""
@@ -513,6 +552,21 @@ class Claimant:
         """Withdraw a request; peers learn of it with the next claim."""
         self.rejected.append(self.pending.pop(award).job.name)
         self._change()
+
+    def _adopt_commit(self, peer: str, award: str, committed: JobOutcome, real_s: float) -> None:
+        """Withdraw a request for a job that another arm may finish, as a peer knows, and record the grant of that arm.
+
+        Else this arm would request the job for ever, and nobody could settle it here.
+        """
+        entry = self.granter.book.jobs.get(committed.job)
+        grant = None if entry is None else entry.grant
+        if grant is not None and grant.record.award != award:  # a lease that was granted here has to end first
+            return
+        try:
+            self.granter.adopt(adopted(self.granter.book, History(peer, committed=(committed,))), real_s)
+        except JournalError as error:
+            _LOG.error("Could not persist the grant of '%s' to '%s': %s", committed.job, committed.arm, error)
+        self._reject(award)
 
     def _expire(self, real_s: float) -> None:
         """Withdraw requests that are not granted in time, drop unneeded votes, and mark new reports."""

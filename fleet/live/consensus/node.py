@@ -20,12 +20,12 @@ from fleet.bus.protocol.auction import JobStatus, LeaseRequest, Report, Submissi
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply, History, HistoryRequest
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
-from fleet.errors import BusError, JournalFull, Refused
+from fleet.errors import BusError, JournalFull, Refused, RefusedForNow, listed
 from fleet.live.arm.node import ArmNode
 from fleet.live.book import JobBook
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Granter
-from fleet.live.consensus.participant import Membership, Participant
+from fleet.live.consensus.participant import TOO_FEW, Membership, Participant
 from fleet.live.desk import JobDesk
 from fleet.live.epochs import REPLY_S, adopted, ask_arms, check_journals, history_of
 from fleet.live.job_rules import SHIFT_ENDED
@@ -76,7 +76,8 @@ class ConsensusNode(JobDesk):
             new_epoch: Begin even if peers know claims of this arm that its journals do not.
 
         Raises:
-            BusError: peers know another epoch, or claims of this arm after those in its journals.
+            BusError: peers know another epoch, or claims of this arm after those in its journals; or the journals are
+                of a fleet of other arms.
             JournalError: the journal is of another arm.
         """
         super().__init__(arm.executor.arm, arm.clock.speed, membership.cell)
@@ -87,6 +88,11 @@ class ConsensusNode(JobDesk):
         real_s = time.monotonic()
         self._recorder = TimeRecorder(journal, book, real_s)
         roster = membership.fleet.arms
+        if book.roster not in ((), tuple(sorted(roster))):
+            raise BusError(
+                f"The journals of '{self._name}' are of a fleet of the arms {listed(book.roster)}, not of "
+                f"{listed(sorted(roster))}: jobs could be done twice. Restore the scenario, or begin in another folder."
+            )
         timing, excludes = membership.timing, membership.excludes
         granter = Granter(self._name, roster, book, journal.append, real_s=real_s, timing=timing, excludes=excludes)
         self._first_number, self._new_epoch = first_number(self._name, boot, book), new_epoch
@@ -104,7 +110,7 @@ class ConsensusNode(JobDesk):
         link, fleet, name = self._link, self._link.fleet, self._name
         link.reply_to(keys.of_arm(fleet, name, "history"), HistoryRequest, self._history)
         self._joined = False
-        """Its peers were asked, when there were any, whether its journals are those that they know."""
+        """A majority, with this arm, was asked whether its journals are those that it knows."""
         self._asked_s = -math.inf
         self._failure: BusError | None = None
         self._join(ask_arms(link))  # before it grants anything
@@ -170,19 +176,21 @@ class ConsensusNode(JobDesk):
                 granter.adopt(adopted(self.book, history), time.monotonic())
             self.participant.count_after(known)
         self._take_epoch(next((history.epoch for history in histories if history.epoch), ""))
+        # Fewer than a majority may not know of an epoch, or of claims of this arm, that the others know.
+        self._joined = len({each.arm for each in histories} | {self._name}) >= self._majority
 
     def _ask_peers(self, real_s: float) -> None:
-        """Ask all peers what they know, before this arm takes or names an epoch."""
+        """Ask all peers what they know, before this arm takes or names an epoch, claims or grants."""
         if real_s < self._asked_s + REPLY_S:
             return
         self._asked_s = real_s
 
         def done(replies: Replies[History]) -> None:
             histories = tuple(replies.messages.values())
+            if self._joined:  # since then it may have claimed, and its peers know that
+                return
             try:
                 self._join(histories)
-                # Fewer than a majority may not know of an epoch that the others have begun.
-                self._joined = len({each.arm for each in histories} | {self._name}) >= self._majority
             except Refused as error:
                 self._warn("journal", f"cannot record what its peers know: {error}")
             except BusError as error:
@@ -203,7 +211,10 @@ class ConsensusNode(JobDesk):
             if time_s >= self._membership.horizon_s and math.isinf(self._ended_s):
                 self._end(real_s, time_s)
             self.participant.set_present(frozenset(self._tokens))
-            self.participant.tick(real_s, time_s)
+            if self._joined:  # else its journals may be an older copy: it claims and grants nothing
+                self.participant.tick(real_s, time_s)
+            else:
+                self._ask_peers(real_s)
             self._send()
             self._recorder.step(real_s, time_s)
         self.wake_s = self.participant.wake_s(real_s)
@@ -281,9 +292,10 @@ class ConsensusNode(JobDesk):
 
     def _take_epoch(self, epoch: str) -> bool:
         """Take the epoch of the fleet, unless there is one on disk already; return whether it is this one."""
-        if epoch and not self._epoch:
+        if epoch and not (self._epoch and self.book.roster):
             try:
-                self.book.record(EpochBegun(epoch))
+                roster = tuple(sorted(self.participant.granter.roster))
+                self.book.record(EpochBegun(self._epoch or epoch, roster=roster))
             except Refused as error:
                 self._warn("epoch", f"cannot record the epoch: {error}")
         elif epoch not in ("", self._epoch):
@@ -297,7 +309,7 @@ class ConsensusNode(JobDesk):
         (self._tokens.add if present else self._tokens.discard)(arm)
 
     def _answer_claim(self, claim: Claim) -> ClaimReply:
-        if claim.arm == self._name or not self._begun:
+        if claim.arm == self._name or not (self._begun and self._joined):
             raise AnotherReplies
         return self.participant.granter.answer_claim(claim, time.monotonic())
 
@@ -309,10 +321,15 @@ class ConsensusNode(JobDesk):
         Raises:
             AnotherReplies: another arm does.
         """
-        # The bid of a peer may begin the fleet's time here before the tokens arrive.
-        present = self._tokens | (self._at_start if time.monotonic() < self._listened_s else frozenset[str]())
-        if not self._begun or self._name != min(present & self.participant.granter.roster, default=self._name):
+        if not self._begun or self._name != min(self._present, default=self._name):
             raise AnotherReplies
+
+    @property
+    def _present(self) -> frozenset[str]:
+        """Present arms of the roster."""
+        # The bid of a peer may begin the fleet's time here before the tokens arrive.
+        at_start = self._at_start if time.monotonic() < self._listened_s else frozenset[str]()
+        return self.participant.granter.roster & (self._tokens | at_start)
 
     @property
     def time_s(self) -> float:
@@ -330,6 +347,9 @@ class ConsensusNode(JobDesk):
         return self.participant.status_of(entries, time.monotonic())
 
     def _submit(self, submission: Submission) -> SubmissionReply:
+        if len(self._present | {self._name}) < self._majority:  # the others may accept another job of the same name
+            self._check_first()
+            raise RefusedForNow(f"{TOO_FEW.format(self._majority)} Submit it again then.")
         later = {job.name: job for _, job in self._stream}
         admissions = self.book.admit(submission.jobs, self.time_s, later)
         accepted = [job for job, reply in zip(submission.jobs, admissions, strict=True) if reply.accepted]

@@ -52,6 +52,8 @@ QUIET_S = 0.05
 """Real seconds without a new bid or choice, after which all arms most likely have the same bids."""
 BID_S = 1.0
 """Real seconds between two bids in which only the costs differ."""
+TOO_FEW = "A majority of the arms, {}, must be present."
+"""Why no job is granted or accepted."""
 NO_CHOICE = Choice("")
 MAX_PAUSES = 4096
 """Jobs whose pauses are known, besides those of which one lasts."""
@@ -278,7 +280,7 @@ class Participant:
             if reason := self._refusal(job.name) or not_ready:
                 return reason
             if fewer:
-                return f"A majority of the arms, {self.claimant.majority}, must be present."
+                return TOO_FEW.format(self.claimant.majority)
             if bidding is None or job.name not in offered:
                 return NOT_OFFERED.format(self._slots)
             return reason_to_wait(bidding, job.name)

@@ -72,9 +72,18 @@ def test_a_job_is_granted_to_one_arm_until_its_lease_ends(granter):
 
 
 def test_a_repeated_claim_renews_the_lease_and_writes_nothing(granter, disk):
-    for number in range(5):
+    granter.answer_claim(claim("a", 0), 0.0)
+    disk.records.clear()
+    for number in range(1, 5):
         assert granted(granter.answer_claim(claim("a", number, entry()), 2.0 * number)) == ["a-1:j"]
         assert [type(record).__name__ for record in disk.records] == ["ClaimNumbered", "Granted"]
+
+
+def test_the_first_claim_of_each_start_of_an_arm_is_recorded(granter, disk):
+    for start in (1, 2):
+        for number in range(1, 4):
+            granter.answer_claim(claim("a", start * NUMBERS_PER_BOOT + number), 0.0)
+    assert [record.number for record in disk.records] == [NUMBERS_PER_BOOT + 1, 2 * NUMBERS_PER_BOOT + 1]
 
 
 def test_arms_and_leases_have_the_same_order_in_every_process(granter):
@@ -141,6 +150,7 @@ def test_an_arm_of_another_fleet_is_granted_nothing(granter):
 
 
 def test_nothing_is_granted_without_space_on_the_disk(granter, disk):
+    granter.answer_claim(claim("a", 0), 0.0)
     disk.full = True
     assert granter.answer_claim(claim("a", 1, entry()), 0.0).denied[0].reason == "no room"
     with pytest.raises(Refused, match="no room"):
