@@ -235,6 +235,11 @@ add_mutation(
 )
 add_mutation("crash-is-sure", "after a crash in the last cycle nobody repeats it", (ArmHistory, "after_restart", _sure))
 add_mutation(
+    "stop-is-sure",
+    "an arm that is stopped in its last cycle does not return it",
+    (AwardExecutor, "stop", lambda _: AwardExecutor.return_all),
+)
+add_mutation(
     "space-ignored",
     "plans that exclude each other are not awarded at a time",
     *((module, "arms_in_the_way", _nobody_in_the_way) for module in (round_module,)),

@@ -30,6 +30,7 @@ from fleet.bus.protocol.operator import (
 )
 from fleet.job import reason_to_give_up
 from fleet.live.leases import Timing
+from scenarios.live.arm import RETIRE_S
 
 LONGEST_WRITES = 60
 """Changing disk calls until a planned crash, at most."""
@@ -73,6 +74,8 @@ class Shift(Fleet):
         """Jobs that a person has asked to redo before their last cycle was begun."""
         self.broken_off: set[str] = set()
         """Jobs of which an arm broke the last cycle off."""
+        self.requests = 0
+        """Number of requests of people."""
         self.work_s = 0.0
         self.healed = False
         self.jobs: list[JobSpec] = []
@@ -533,7 +536,8 @@ def request(shift: Shift, action: Action) -> None:
         shift.cancelled.add(action.job)
     elif redone:
         shift.redone.add(redone)
-    message = ControlRequest(str(shift.world.now_s), action, "a person")
+    shift.requests += 1
+    message = ControlRequest(f"request {shift.requests}", action, "a person")
     shift.world.log("person", f"requests {action}")
     link: Any = shift.world.processes[CLIENT].client
 
@@ -551,6 +555,20 @@ def request(shift: Shift, action: Action) -> None:
         shift.world.after(shift.rng.uniform(0.0, 30.0), send)
 
 
+def stop_politely(shift: Shift) -> None:
+    """Stop an arm at work as by SIGTERM: its process retires, and exits soon after."""
+    process = _arm(shift, busy=True)
+    node: Any = process.node
+    if node is not None and not process.paused:
+        process._call(lambda: node.retire(process.real_s))
+        shift.world.after(RETIRE_S, _exit, process, process.boot)
+
+
+def _exit(process: Process, boot: int) -> None:
+    if process.boot == boot:
+        process.kill("exits")
+
+
 def kill_supervisor(shift: Shift) -> None:
     """Kill the supervisor, and with it all processes."""
     if shift.rng.random() < 0.3:
@@ -561,6 +579,7 @@ FAULTS = (
     *(kill, kill_at_work, lose_power, crash_at_write, crash_at_write, fill_disk, break_disk, stop, stop_at_work, cut),
     *(cut_off_at_work, cut_off_at_work, lose_router, lose_messages, lose_messages, overheat, break_machine, move_home),
     *(kill_supervisor, fill_log_disk, lose_rack, swizzle, steer, steer, redo_early),
+    *(stop_politely, stop_politely),
 )
 
 

@@ -108,6 +108,20 @@ def test_the_job_of_a_killed_arm_is_returned_with_its_cycles(fleet):
     fleet.until(lambda: fleet.is_everywhere("a", "finished"))
 
 
+@pytest.mark.parametrize(("exits", "state"), [(False, "finished"), (True, "unfinished")])
+def test_an_arm_that_is_stopped_in_its_last_cycle_finishes_the_job_or_leaves_it_unfinished(fleet, exits, state):
+    fleet.submit(job("a", 1, **LONG))
+    fleet.until(lambda: bool(fleet.begun))
+    (arm,) = fleet.away
+    fleet.call(arm, lambda: fleet.node(arm).retire(fleet.world.processes[arm].real_s))
+    fleet.run(1.0)
+    if exits:
+        fleet.restart(arm)
+    fleet.until(lambda: fleet.is_everywhere("a", state))
+    fleet.run(TIMING.lease_s + 5.0)
+    assert (fleet.begun, fleet.states("a")) == ({"a": 1}, {state})
+
+
 def test_a_job_that_still_waits_at_its_hard_due_date_is_given_up_with_its_successors(fleet):
     fleet.submit(job("begun", 30, due_s=60.0, expires=True), job("soft", 2, place="place of begun", due_s=60.0))
     fleet.until(lambda: bool(fleet.away))

@@ -468,6 +468,17 @@ class AwardExecutor:
         for number, active in enumerate(self.active):
             self._close(active, "returned", time_s, now_s, reason, faulted=faulted and number == 0)
 
+    def stop(self, time_s: float, now_s: float, reason: str) -> None:
+        """Return every award, as the arm stops; one with permission to commit only once its last cycle has ended.
+
+        It is returned at home if that cycle was not begun. Otherwise the next start returns it as unsure.
+        """
+        for active in self.active:
+            if active.may_commit:
+                active.revoked, active.why = True, reason
+            else:
+                self._close(active, "returned", time_s, now_s, reason)
+
     def revoke(self, reason: str, is_stopped: Callable[[str], bool] = lambda job: True) -> None:
         """Begin no more cycles of these jobs unless their last cycle is permitted, and return them.
 

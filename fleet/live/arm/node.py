@@ -429,15 +429,16 @@ class ArmNode:
     def retire(self, until_s: float) -> None:
         """Return all awards, report them until they are acknowledged, and quote the space of an arm at home.
 
+        A last cycle in progress ends first; an award that is left returns at the next start.
         The last state says that the arm leaves. At the latest it ends when `time.monotonic()` is `until_s`.
         """
         self._leaving = True
-        self.executor.return_all(self._body.time_s, time.monotonic(), "The arm was stopped.")
+        self.executor.stop(self._body.time_s, time.monotonic(), "The arm was stopped.")
         reported_s = time.monotonic() if self.executor.has_pending_reports else -math.inf
         while time.monotonic() < until_s:
             if self.executor.has_pending_reports:
                 reported_s = time.monotonic()
-            elif self._body.away is not None or self._quoted_s >= reported_s:
+            elif not self.executor.active and (self._body.away is not None or self._quoted_s >= reported_s):
                 break
             self.serve(min(until_s, time.monotonic() + POLL_S))
         self._send_state()
