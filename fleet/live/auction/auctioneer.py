@@ -92,7 +92,7 @@ class Auctioneer:
         """
         admissions = self.book.admit(submission.jobs, time_s, reserved=reserved)
         accepted = {job.name: job for job, reply in zip(submission.jobs, admissions, strict=True) if reply.accepted}
-        new = tuple(j for name, j in accepted.items() if name not in self.book.jobs and name not in self.book.past)
+        new = tuple(job for name, job in accepted.items() if not self.book.is_known(name))
         if new:
             self.book.record(JobsAccepted(new, submission.by, time_s))
             self.rounds.retry_now()
@@ -140,9 +140,15 @@ class Auctioneer:
             Refused: the award is another arm's, or for another job.
         """
         receipt, grant = Receipt(self.name, report.award), self.book.grant_of(report.award, report.job)
+        shown = replace(report, time_s=min(report.time_s, time_s), reason=report.reason[:MAX_REASON])
+        faults = {report.award: report.arm} if report.faulted else {}
         if grant is None:
-            # It was settled long ago, or its journal is lost. The receipt ends the repetition of the report.
+            # It was settled long ago, or the journal is an older copy. The receipt ends the repetition of the report.
             _LOG.warning("'%s' reports on an unknown award: %s.", report.arm, report.award)
+            outcome = outcome_of(shown, faults)
+            counts = outcome.outcome == "returned" and report.job in self.book.jobs
+            if (counts or outcome.outcome == "unfinished") and self.book.is_news(outcome):
+                self.book.record(JobSettled(outcome))
             return receipt
         arm, job = grant.record.arm, grant.record.job
         if (arm, job) != (report.arm, report.job):
@@ -156,11 +162,10 @@ class Auctioneer:
                 doubts.append(f"'{arm}' reports '{job}' {counts}: it counts as finished.")
             for doubt in doubts:
                 _LOG.error("%s", doubt)
-            reason = joined_reasons(report.reason, " ".join(doubts))[:MAX_REASON]
+            shown = replace(shown, reason=joined_reasons(report.reason, " ".join(doubts))[:MAX_REASON])
             # The space of an award that has ended may have been freed since.
             space = retaken_space(self.book, arm, {grant.record.space}) if grant.outcome else []
-            shown = replace(report, time_s=min(report.time_s, time_s), reason=reason)
-            self.book.record(*space, JobSettled(outcome_of(shown, {report.award: arm} if report.faulted else {})))
+            self.book.record(*space, JobSettled(outcome_of(shown, faults)))
             if report.outcome == "finished":
                 self.rounds.retry_now()
             else:

@@ -67,6 +67,25 @@ def lose_journal(fleet: SimulatedFleet) -> None:
     fleet.world.after_run = fleet.world.bus.on_publish = lambda *_: None
 
 
+def restore(fleet: SimulatedFleet, copy: Any) -> None:
+    """Give the auctioneer an older copy of its journal."""
+    lose_journal(fleet)
+    fleet.world.processes[AUCTIONEER].disk.names = deepcopy(copy)
+    fleet.auctioneer()
+
+
+def begun_after_copy(fleet_of: Any, spec: JobSpec) -> tuple[SimulatedFleet, Any, str]:
+    """A fleet, a copy of the auctioneer's journal in which a job waits, and the arm that has left home for it."""
+    fleet = fleet_of(alone=False, only=(AUCTIONEER,))
+    fleet.submit(spec)
+    copy = deepcopy(fleet.world.processes[AUCTIONEER].disk.names)
+    for arm in fleet.arms:
+        fleet.world.processes[arm].start()
+    fleet.until(lambda: bool(fleet.away))
+    (arm,) = fleet.away
+    return fleet, copy, arm
+
+
 def of_arm(fleet: SimulatedFleet) -> list[str]:
     """What the auctioneer has logged about the arm."""
     return fleet.logged("Arm 'arm_0' ")
@@ -317,6 +336,34 @@ def test_an_older_copy_of_the_journal_learns_of_a_permission_to_commit(fleet_of)
     fleet.cut()
     fleet.until(lambda: fleet.is_everywhere("a", "finished"))
     assert fleet.finished == {"a": 1}
+
+
+def test_an_older_copy_learns_from_an_unsure_report_on_an_award_that_it_does_not_know(fleet_of):
+    fleet, copy, arm = begun_after_copy(fleet_of, job("a", 1, **LONG))
+    fleet.until(lambda: bool(fleet.begun))
+    fleet.world.processes[arm].kill("is killed")
+    restore(fleet, copy)
+    fleet.world.processes[arm].start()
+    fleet.run(20.0)
+    assert fleet.states("a") == {"unfinished"}
+    assert fleet.submit(job("a", 1, **LONG))[0].accepted
+
+
+def test_an_unsure_report_on_a_job_that_is_not_known_leaves_it_unfinished(one):
+    report = Report("arm_0", "9:a", "a", "returned", 2, 1.0, "crashed", unsure=True)
+    one.ask(keys.asked_by("f", AUCTIONEER, "report", "arm_0"), report, Receipt)
+    assert one.submit(job("a", 3))[0].accepted
+    one.run(5.0)
+    assert (one.status("a").state, one.begun, one.away) == ("unfinished", {}, {})
+
+
+def test_an_older_copy_counts_the_cycles_of_an_award_that_it_does_not_know(fleet_of):
+    fleet, copy, arm = begun_after_copy(fleet_of, job("a", 60, dwell_s=20.0))
+    fleet.run(40.0)
+    done = fleet.builders[arm].machine.cycles
+    restore(fleet, copy)
+    fleet.run(20.0)
+    assert fleet.status("a").cycles >= done > 5
 
 
 def test_fleet_time_continues_as_the_arms_have_kept_it_while_there_was_no_auctioneer(fleet_of):
