@@ -4,7 +4,7 @@ import logging
 import math
 import secrets
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from contextlib import suppress
 from functools import partial
 
@@ -53,26 +53,41 @@ _LOG = logging.getLogger(__name__)
 class EpochCheck:
     """Which arms have sent their history, and whether it is one of this auctioneer's journal."""
 
-    def __init__(self, link: BusClient, auctioneer: Auctioneer) -> None:
-        """Start; no arm is admitted yet."""
+    def __init__(self, link: BusClient, auctioneer: Auctioneer, hold_s: float) -> None:
+        """Start; no arm is admitted yet.
+
+        Args:
+            hold_s: Real seconds for which no job is awarded unless all arms have sent their history.
+        """
         self._link, self._auctioneer = link, auctioneer
         self._asked_s: dict[str, float] = {}
         """Real second of the last request to each arm that has not sent its history."""
         self._admitted: set[str] = set()
+        self._replied: set[str] = set()
+        """Arms that have been admitted since the start."""
+        self._hold_until_s = time.monotonic() + hold_s
         self._foreign: dict[str, str] = {}
-        """Why an arm gets no work, by arm."""
+        """Why the history of an arm does not fit, by arm."""
 
     @property
     def objection(self) -> str:
-        """Why no jobs are accepted; "" if they are."""
+        """Why no jobs are accepted or awarded; "" if they are."""
         return next(iter(self._foreign.values()), "")
 
     def admitted(self, arms: Iterable[str]) -> frozenset[str]:
-        """Return those of these arms whose history fits; request the others'."""
+        """Return those of these arms that get jobs: their history fits, and no other one may know more of the jobs.
+
+        Request missing histories.
+        """
         arms = frozenset(arms)
-        for arm in sorted(arms - self._admitted - self._foreign.keys()):
+        for arm in sorted(arms - self._admitted):
             self._ask(arm)
-        return arms & self._admitted
+        return frozenset() if self.objection or self.awaited(arms) else arms & self._admitted
+
+    def awaited(self, arms: Iterable[str]) -> Set[str]:
+        """Return the arms, of these and of the cell, without whose history no job is awarded."""
+        all_arms = {*arms, *self._auctioneer.book.arms} if time.monotonic() < self._hold_until_s else set[str]()
+        return all_arms - self._replied
 
     def forget(self, arm: str) -> None:
         """Forget an arm that has left: it may come back with another history."""
@@ -89,10 +104,16 @@ class EpochCheck:
         def done(replies: Replies[History]) -> None:
             if "" in replies.refused.values():  # it did not reply in time
                 return
+            for reason in replies.refused.values():
+                remedy = "Update it; or stop it, and jobs that only it knows as done may be done again"
+                self._object(arm, f"the history of '{arm}' cannot be read ({reason}). {remedy}.")
+                return
             for history in replies.messages.values():
                 if not self._accept(history):
                     return
+            self._foreign.pop(arm, None)
             self._admitted.add(arm)  # an arm of another maker may have no history
+            self._replied.add(arm)
 
         self._link.query(
             keys.of_arm(self._link.fleet, arm, "history"), HistoryRequest(), History, done, timeout_s=REPLY_S
@@ -102,11 +123,8 @@ class EpochCheck:
         """Adopt what an arm knows; return whether it fits and is on disk."""
         book = self._auctioneer.book
         if history.epoch not in ("", book.epoch) and not book.succeeds:
-            self._foreign[history.arm] = (
-                f"No jobs are accepted: the journal has the epoch '{book.epoch}', but {describe(history)}. {REMEDY} "
-                f"Or stop '{history.arm}', if it alone is wrong."
-            )
-            _LOG.error("%s", self._foreign[history.arm])
+            what = f"the journal has the epoch '{book.epoch}', but {describe(history)}"
+            self._object(history.arm, f"{what}. {REMEDY} Or stop '{history.arm}', if it alone is wrong.")
             return False
         try:
             self._auctioneer.adopt(history, time.monotonic())
@@ -115,7 +133,14 @@ class EpochCheck:
             return False
         return True
 
+    def _object(self, arm: str, reason: str) -> None:
+        if arm not in self._foreign:
+            self._foreign[arm] = f"No jobs are accepted or awarded: {reason}"
+            _LOG.error("%s", self._foreign[arm])
 
+
+HOLD_S = 20.0
+"""Real seconds for which an auctioneer that continues from a journal waits for the histories of all arms."""
 OTHERS_S = 2.0
 """Real seconds that another auctioneer has to reply at the start."""
 CHECK_S = 1.0
@@ -175,7 +200,8 @@ class AuctionNode(JobDesk):
         self._check_no_auctioneer()
         book = self.book = JobBook(places, arms).replay(own_records(journal, name))
         histories = ask_arms(link)
-        if not (book.epoch or new_epoch):
+        continues = bool(book.epoch or new_epoch)
+        if not continues:
             check_begin(link.fleet, histories)
         real_s = time.monotonic()
         self._recorder = TimeRecorder(journal, book, real_s)
@@ -195,7 +221,7 @@ class AuctionNode(JobDesk):
             timing=self._timing,
             excludes=excludes,
         )
-        self._epochs = EpochCheck(link, self.auctioneer)
+        self._epochs = EpochCheck(link, self.auctioneer, HOLD_S if continues else 0.0)
         self.rivals: set[str] = set()
         self._check_s = self._alone_s = -math.inf
         self._tokens: set[str] = set()
@@ -308,7 +334,7 @@ class AuctionNode(JobDesk):
             return trouble
         if not alone:
             return "It is being checked whether the fleet has another auctioneer."
-        waits = ", ".join(sorted(self.present))
+        waits = ", ".join(sorted(self._epochs.awaited(self.present) or self.present))
         return f"It is not known yet which jobs have been done by {waits}." if waits else ""
 
     def _trouble(self) -> str:

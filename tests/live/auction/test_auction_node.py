@@ -33,7 +33,7 @@ from fleet.bus.protocol.operator import ControlRequest, Operation, Pause
 from fleet.errors import JournalFull, Refused
 from fleet.live.auction import node as auction_node
 from fleet.live.auction.auctioneer import Auctioneer
-from fleet.live.auction.node import AuctionNode
+from fleet.live.auction.node import HOLD_S, AuctionNode
 from fleet.live.book import JobBook
 from fleet.live.epochs import kept_time_s
 from fleet.live.journal import EpochBegun, JobsAccepted, Journal
@@ -360,10 +360,60 @@ def test_an_unsure_report_on_a_job_that_is_not_known_leaves_it_unfinished(one):
 def test_an_older_copy_counts_the_cycles_of_an_award_that_it_does_not_know(fleet_of):
     fleet, copy, arm = begun_after_copy(fleet_of, job("a", 60, dwell_s=20.0))
     fleet.run(40.0)
-    done = fleet.builders[arm].machine.cycles
+    machine: Any = fleet.builders[arm].machine
+    done = machine.cycles
     restore(fleet, copy)
     fleet.run(20.0)
     assert fleet.status("a").cycles >= done > 5
+
+
+@pytest.mark.parametrize("case", ["late", "absent", "unreadable"])
+def test_an_older_copy_awards_nothing_before_all_arms_have_told_what_they_have_done(fleet_of, monkeypatch, case):
+    fleet, copy, arm = begun_after_copy(fleet_of, job("a", 1, **LONG))
+    others, updated = [each for each in fleet.arms if each != arm], list[str]()
+    fleet.until(lambda: fleet.is_everywhere("a", "finished"))
+    fleet.run(3.0)
+    if case == "absent":
+        for each in fleet.arms:
+            fleet.world.processes[each].kill("loses power")
+        restore(fleet, copy)
+        for each in others:
+            fleet.world.processes[each].start()
+    elif case == "late":
+        with monkeypatch.context() as before:
+            before.setattr(fleet.world, "send", fleet.world.send)
+            fleet.lose(f"{arm}/history")
+            restore(fleet, copy)
+            fleet.run(3.0)
+    else:
+        fleet.intercept(arm, "history", lambda request, reply_to: (reply_to if updated else malformed)(request))
+        restore(fleet, copy)
+    fleet.until(lambda: bool(boss(fleet)._epochs._replied))
+    fleet.run(3.0)
+    assert arm in fleet.status("a").reason
+    if case == "unreadable":
+        fleet.run(30.0)
+        assert f"the history of '{arm}' cannot be read (Not a" in refused(lambda: fleet.submit(job("b")))
+        assert boss(fleet)._trouble() == fleet.status("a").reason
+        updated.append(arm)
+    elif case == "absent":
+        fleet.world.processes[arm].start()
+    fleet.until(lambda: fleet.is_everywhere("a", "finished"))
+    fleet.submit(job("b", 1))
+    fleet.until(lambda: fleet.is_everywhere("b", "finished"))
+    assert fleet.begun == {"a": 1, "b": 1}
+
+
+def test_an_auctioneer_waits_for_an_arm_that_stays_away_a_limited_time(fleet_of):
+    fleet = fleet_of(alone=False, only=(AUCTIONEER, "arm_0"))
+    fleet.submit(job("a", 1))
+    fleet.until(lambda: fleet.is_everywhere("a", "finished"))
+    fleet.auctioneer()
+    start_s = fleet.world.now_s
+    fleet.submit(job("b", 1))
+    fleet.until(lambda: "have been done by arm_1, arm_2." in fleet.status("b").reason)
+    fleet.until(lambda: fleet.is_everywhere("b", "finished"))
+    assert HOLD_S < fleet.world.now_s - start_s < HOLD_S + 5.0
 
 
 def test_fleet_time_continues_as_the_arms_have_kept_it_while_there_was_no_auctioneer(fleet_of):
