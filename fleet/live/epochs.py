@@ -144,6 +144,10 @@ def adopted(book: JobBook, history: History) -> list[BookRecord]:
             records.append(JobsAccepted((award.job,), f"adopted from {history.arm}", book.time_s))
             records.append(_adopted_award(award, history, book.time_s))
     for outcome in history.committed:
+        if book.is_central:  # an older copy lacks a report that it had received
+            if not book.is_settled(outcome.job) and book.is_news(outcome):
+                records.append(JobSettled(outcome))
+            continue
         entry = book.jobs.get(outcome.job)
         grant = None if entry is None else entry.grant
         if book.is_settled(outcome.job) or (grant is not None and grant.may_commit):

@@ -5,8 +5,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from fleet.bus.protocol.auction import Award, JobSpec, Lease, Receipt
-from fleet.live.arm.awards import CLOCK_DRIFT, MAX_PAST_AWARDS, ArmHistory, AwardExecutor, ExecutorConfig
+from fleet.bus.protocol.auction import Award, JobSpec, Lease, Receipt, Report
+from fleet.live.arm.awards import (
+    CLOCK_DRIFT,
+    MAX_PAST_AWARDS,
+    MAX_UNSURE,
+    ArmHistory,
+    AwardAccepted,
+    AwardExecutor,
+    Closed,
+    ExecutorConfig,
+)
 from tests.live.disk import Disk
 
 JOB = JobSpec(name="j", kind="hold", places=("p",), repetitions=3)
@@ -337,6 +346,22 @@ def test_an_arm_that_may_have_finished_a_job_returns_it_as_unsure():
     assert (report.outcome, report.cycles, report.unsure) == ("returned", 2, True)
     assert restarted.answer_award(award, 0.2).accepted  # the same answer after the restart
     assert not restarted.answer_award(replace(award, award="other"), 0.2).accepted  # on the same quote
+    restarted.apply_receipt(Receipt("x", report.award))
+    for _ in range(2):
+        restarted, _ = shop(disk)
+        (outcome,) = ArmHistory().replay(disk.records).message("a").committed
+        assert (outcome.job, outcome.award, outcome.outcome, outcome.cycles) == ("j", report.award, "unfinished", 2)
+    finished(restarted, taken(restarted, award="again"))
+    assert ArmHistory().replay(disk.records).message("a").committed == ()
+
+
+def test_the_last_jobs_that_an_arm_may_have_finished_are_kept():
+    history = ArmHistory()
+    for number in range(MAX_UNSURE + 1):
+        report = Report("a", f"w{number}", f"j{number}", "returned", 2, 1.0, unsure=True)
+        history.apply(AwardAccepted(award_on("q", replace(JOB, name=report.job), award=report.award)))
+        history.apply(Closed(report))
+    assert [outcome.job for outcome in history.message("a").committed] == [f"j{n}" for n in range(1, MAX_UNSURE + 1)]
 
 
 def test_an_award_is_kept_over_many_restarts_and_the_journal_stays_small():

@@ -40,9 +40,12 @@ from fleet.bus.protocol.consensus import MOST_FINISHED, History, with_finished
 from fleet.errors import JournalFull
 from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.journal import CommitPermitted, JournalState, Progress, Released, Started
+from fleet.live.records import outcome_of
 
 MAX_PAST_AWARDS = 256
 """Closed awards whose answer is kept; their quotes expired long ago."""
+MAX_UNSURE = 32
+"""Jobs kept whose last cycle the arm may have done."""
 REVOKED = "The award was revoked."
 """Why an award is returned that an auctioneer, or a person, has revoked."""
 
@@ -80,10 +83,11 @@ class PastAward(msgspec.Struct, frozen=True, tag="past_award"):
 
 
 class JobsFinished(msgspec.Struct, frozen=True, tag="jobs_finished"):
-    """Jobs that the arm finished, and the last epoch that it knows."""
+    """Jobs that the arm finished, or may have finished, and the last epoch that it knows."""
 
     jobs: tuple[JobSpec, ...]
     epoch: str = ""
+    unsure: tuple[Report, ...] = ()
 
 
 ArmRecord = (
@@ -145,6 +149,8 @@ class ArmHistory(JournalState[ArmRecord]):
     """Of the last accepted award that has one."""
     finished: dict[str, JobSpec] = field(default_factory=dict[str, JobSpec])
     """The last jobs that the arm finished, oldest first."""
+    unsure: dict[str, Report] = field(default_factory=dict[str, Report])
+    """The last jobs whose last cycle it may have done, oldest first."""
     name: str = ""
     """Of the arm."""
 
@@ -170,20 +176,31 @@ class ArmHistory(JournalState[ArmRecord]):
                     self.reports[report.award] = award, report
                     if report.outcome == "finished":
                         self._finish(award.job)
+                    elif report.unsure:
+                        self._doubt(report)
             case Released(name):
                 self.active.pop(name, None)
             case ReportReceived(name):
                 self.reports.pop(name, None)
             case PastAward(name, job):
                 self.accepted[name] = job
-            case JobsFinished(jobs, epoch):
+            case JobsFinished(jobs, epoch, unsure):
                 self.epoch = epoch or self.epoch
                 for job in jobs:
                     self._finish(job)
+                for report in unsure:
+                    self._doubt(report)
             case FaultCleared():
                 pass
 
+    def _doubt(self, report: Report) -> None:
+        self.unsure.pop(report.job, None)
+        self.unsure[report.job] = report
+        if len(self.unsure) > MAX_UNSURE:
+            del self.unsure[next(iter(self.unsure))]
+
     def _finish(self, job: JobSpec) -> None:
+        self.unsure.pop(job.name, None)
         self.finished.pop(job.name, None)
         self.finished[job.name] = job
         if len(self.finished) > MOST_FINISHED:
@@ -193,7 +210,8 @@ class ArmHistory(JournalState[ArmRecord]):
         """Return the fewest records that give the same history, without closed awards of long ago."""
         self.accepted = bounded(self.accepted, [*self.reports, *self.active])
         records: list[ArmRecord] = [Started(self.name, boot=self.boot)]
-        records += [JobsFinished(tuple(self.finished.values()), self.epoch)] if self.epoch or self.finished else []
+        if self.epoch or self.finished or self.unsure:
+            records.append(JobsFinished(tuple(self.finished.values()), self.epoch, tuple(self.unsure.values())))
         records += [PastAward(name, job) for name, job in self.accepted.items()]
         for award, report in self.reports.values():
             records += [AwardAccepted(award), Closed(report)]
@@ -210,7 +228,13 @@ class ArmHistory(JournalState[ArmRecord]):
             report = Report(arm, name, active.job, "returned", active.cycles, time_s, reason, unsure=active.may_commit)
             reports[name] = active.award, report
         accepted = bounded(self.accepted, reports)
-        return ArmHistory(self.boot + 1, {}, reports, accepted, self.epoch, dict(self.finished), arm)
+        after = ArmHistory(
+            self.boot + 1, {}, reports, accepted, self.epoch, dict(self.finished), dict(self.unsure), arm
+        )
+        for _, report in reports.values():
+            if report.unsure:
+                after._doubt(report)
+        return after
 
     def message(self, arm: str, time_s: float = 0.0) -> History:
         """Return what the arm has done and has, as much as fits into one message.
@@ -221,7 +245,8 @@ class ArmHistory(JournalState[ArmRecord]):
         active = list(self.active.values())[:MOST_JOBS]
         awards = tuple(replace(each.award, cycles=each.cycles) for each in active)
         may_commit = tuple(each.award.award for each in active if each.may_commit)
-        history = History(arm, self.epoch, (), awards, may_commit, time_s=time_s)
+        unsure = tuple(outcome_of(report, {}) for report in self.unsure.values())
+        history = History(arm, self.epoch, (), awards, may_commit, committed=unsure, time_s=time_s)
         return with_finished(history, list(self.finished.values()))
 
 

@@ -29,7 +29,7 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.consensus import History
 from fleet.bus.protocol.keys import HISTORY
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import ControlRequest, Operation, Pause
+from fleet.bus.protocol.operator import ControlRequest, Operation, Pause, Settle
 from fleet.errors import JournalFull, Refused
 from fleet.live.auction import node as auction_node
 from fleet.live.auction.auctioneer import Auctioneer
@@ -365,6 +365,24 @@ def test_an_older_copy_counts_the_cycles_of_an_award_that_it_does_not_know(fleet
     restore(fleet, copy)
     fleet.run(20.0)
     assert fleet.status("a").cycles >= done > 5
+
+
+@pytest.mark.parametrize("settled", [False, True])
+def test_an_older_copy_learns_of_an_unsure_report_that_was_received_before(fleet_of, settled):
+    fleet, copy, arm = begun_after_copy(fleet_of, job("a", 1, **LONG))
+    fleet.until(lambda: bool(fleet.begun))
+    fleet.restart(arm)
+    fleet.until(lambda: fleet.states("a") == {"unfinished"})
+    if settled:
+        fleet.control(Settle("a", "done"))
+    fleet.run(3.0)
+    restore(fleet, copy)
+    fleet.run(20.0)
+    assert fleet.states("a") == {"unfinished"}
+    fleet.control(Settle("a", "redo"))
+    fleet.begun.clear()
+    fleet.auctioneer()
+    fleet.until(lambda: fleet.is_everywhere("a", "finished"))
 
 
 @pytest.mark.parametrize("case", ["late", "absent", "unreadable"])
