@@ -275,7 +275,7 @@ class Shift(Fleet):
                 raise Violation(f"'{name}' is called finished, and was done {done} times.")
             if done and state != "finished" and name not in self.unsure:
                 raise Violation(f"'{name}' was done, and is called {state}.")
-            if state == "unfinished" and name not in self.unsure:
+            if state == "unfinished" and name not in self.unsure and not self._lacks_permission(name):
                 raise Violation(f"'{name}' is unfinished, and no arm stopped in its last cycle.")
             if state == "cancelled" and name not in self.cancelled:
                 raise Violation(f"'{name}' is cancelled, and nobody asked for it.")
@@ -287,6 +287,12 @@ class Shift(Fleet):
 
         if not self.alone:
             check_steering(self.sent, states, self.node(AUCTIONEER).auctioneer.book.jobs)
+
+    def _lacks_permission(self, name: str) -> bool:
+        """Whether the arm of a job was restarted before it received the permission to commit that it was given."""
+        entry = None if self.alone else self.node(AUCTIONEER).book.jobs.get(name)
+        permitted = entry is not None and entry.award in entry.grants and entry.grants[entry.award].may_commit
+        return permitted and "lacks its permission to commit" in entry.reason
 
     def _check_space(self) -> None:
         """Check that arms that are idle at home take no space: it would stay closed if they left now.

@@ -225,8 +225,8 @@ class ArmHistory(JournalState[ArmRecord]):
         reports = dict(self.reports)
         for name, active in self.active.items():
             reason = "the arm was restarted" + (" after it was permitted to commit" if active.may_commit else "")
-            report = Report(arm, name, active.job, "returned", active.cycles, time_s, reason, unsure=active.may_commit)
-            reports[name] = active.award, report
+            report = Report(arm, name, active.job, "returned", active.cycles, time_s, reason, restarted=True)
+            reports[name] = active.award, replace(report, unsure=active.may_commit)
         accepted = bounded(self.accepted, reports)
         after = ArmHistory(
             self.boot + 1, {}, reports, accepted, self.epoch, dict(self.finished), dict(self.unsure), arm

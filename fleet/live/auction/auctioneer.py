@@ -160,6 +160,9 @@ class Auctioneer:
             if report.outcome == "finished" and spec is not None and report.cycles != spec.repetitions:
                 counts = f"finished after {report.cycles} cycles, but it has {spec.repetitions}"
                 doubts.append(f"'{arm}' reports '{job}' {counts}: it counts as finished.")
+            if report.restarted and grant.may_commit and not report.unsure:
+                doubts.append(f"The journal of '{arm}' lacks its permission to commit '{job}': it may have been done.")
+                shown = replace(shown, unsure=True)
             for doubt in doubts:
                 _LOG.error("%s", doubt)
             shown = replace(shown, reason=joined_reasons(report.reason, " ".join(doubts))[:MAX_REASON])

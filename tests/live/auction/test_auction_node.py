@@ -385,6 +385,21 @@ def test_an_older_copy_learns_of_an_unsure_report_that_was_received_before(fleet
     fleet.until(lambda: fleet.is_everywhere("a", "finished"))
 
 
+def test_an_older_copy_of_the_journal_of_an_arm_without_permission_to_commit_leaves_the_job_unfinished(fleet_of):
+    fleet = fleet_of(alone=False)
+    fleet.submit(job("a", 2, **LONG))
+    fleet.until(lambda: bool(fleet.away))
+    (arm,) = fleet.away
+    process = fleet.world.processes[arm]
+    copy = deepcopy(process.disk.names)
+    fleet.until(lambda: bool(fleet.begun))
+    process.kill("is killed")
+    process.disk.names = copy
+    process.start()
+    fleet.until(lambda: fleet.is_everywhere("a", "unfinished"))
+    assert f"The journal of '{arm}' lacks its permission to commit 'a'" in fleet.status("a").reason
+
+
 @pytest.mark.parametrize("case", ["late", "absent", "unreadable"])
 def test_an_older_copy_awards_nothing_before_all_arms_have_told_what_they_have_done(fleet_of, monkeypatch, case):
     fleet, copy, arm = begun_after_copy(fleet_of, job("a", 1, **LONG))
