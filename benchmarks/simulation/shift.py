@@ -290,8 +290,10 @@ class Shift(Fleet):
 
     def _lacks_permission(self, name: str) -> bool:
         """Whether the arm of a job was restarted before it received the permission to commit that it was given."""
-        entry = None if self.alone else self.node(AUCTIONEER).book.jobs.get(name)
-        permitted = entry is not None and entry.award in entry.grants and entry.grants[entry.award].may_commit
+        if self.alone:
+            return False
+        entry = self.node(AUCTIONEER).book.jobs[name]
+        permitted = entry.award in entry.grants and entry.grants[entry.award].may_commit
         return permitted and "lacks its permission to commit" in entry.reason
 
     def _check_space(self) -> None:

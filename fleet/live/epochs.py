@@ -131,10 +131,27 @@ def adopted(book: JobBook, history: History) -> list[BookRecord]:
     if unknown:
         records.append(HistoryAdopted(history.arm, unknown, book.time_s))
     done = {job.name for job in unknown}
-    for award in history.awards:
-        if award.auctioneer != book.name or award.job.name in done:
+    held = {award.award for award in history.awards}
+    for job in history.finished:  # an older copy lacks the report of the arm that had permission to commit
+        entry = book.jobs.get(job.name)
+        grant = None if entry is None or not is_open(job, "finishing", "unfinished") else entry.grant
+        if grant is None or not grant.may_commit or grant.record.arm != history.arm:
             continue
+        if grant.record.award not in held:
+            reason = f"'{history.arm}' had finished it; the journal did not know it."
+            terms = (grant.record.award, history.arm, "finished", job.repetitions, book.time_s, reason)
+            records.append(JobSettled(JobOutcome(job.name, *terms)))
+    for award in history.awards:
         permitted = award.award in history.may_commit
+        if award.job.name in done:
+            continue
+        if award.auctioneer != book.name:  # it reports the end of the award to an auctioneer that is gone
+            if permitted and is_open(award.job, "waiting", "awarded"):
+                records.append(JobsAccepted((award.job,), f"adopted from {history.arm}", book.time_s))
+                reason = f"'{history.arm}' has permission to commit from another auctioneer, '{award.auctioneer}'."
+                terms = (award.award, history.arm, "unfinished", award.cycles, book.time_s, reason)
+                records.append(JobSettled(JobOutcome(award.job.name, *terms)))
+            continue
         states: tuple[JobState, ...] = ("waiting", "awarded") if permitted else ("waiting",)
         if (grant := book.open.get(award.award)) is not None:
             own = (grant.record.arm, grant.record.job) == (history.arm, award.job.name)

@@ -400,6 +400,30 @@ def test_an_older_copy_of_the_journal_of_an_arm_without_permission_to_commit_lea
     assert f"The journal of '{arm}' lacks its permission to commit 'a'" in fleet.status("a").reason
 
 
+def test_an_older_copy_in_which_a_job_is_finishing_learns_that_its_arm_has_finished_it(one):
+    one.submit(job("a", 1, **LONG))
+    one.until(lambda: bool(one.begun))
+    copy = deepcopy(one.world.processes[AUCTIONEER].disk.names)
+    one.until(lambda: one.is_everywhere("a", "finished"))
+    one.run(3.0)
+    restore(one, copy)
+    one.until(lambda: one.is_everywhere("a", "finished"))
+
+
+def test_an_auctioneer_of_another_name_leaves_a_last_cycle_in_progress_unfinished(fleet_of):
+    fleet = fleet_of(alone=False)
+    fleet.submit(job("a", 1, **LONG))
+    fleet.until(lambda: bool(fleet.begun))
+    lose_journal(fleet)
+    fleet.run(3.0)
+    fleet.auctioneer(name="boss_2", new_epoch=True)
+    fleet.until(lambda: fleet.states("a") == {"unfinished"})
+    assert "from another auctioneer, 'auctioneer'." in fleet.status("a").reason
+    assert fleet.submit(job("a", 1, **LONG))[0].accepted
+    fleet.run(20.0)
+    assert (fleet.begun, fleet.states("a")) == ({"a": 1}, {"unfinished"})
+
+
 @pytest.mark.parametrize("case", ["late", "absent", "unreadable"])
 def test_an_older_copy_awards_nothing_before_all_arms_have_told_what_they_have_done(fleet_of, monkeypatch, case):
     fleet, copy, arm = begun_after_copy(fleet_of, job("a", 1, **LONG))
