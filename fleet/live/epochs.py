@@ -146,11 +146,12 @@ def adopted(book: JobBook, history: History) -> list[BookRecord]:
         if award.job.name in done:
             continue
         if award.auctioneer != book.name:  # it reports the end of the award to an auctioneer that is gone
-            if permitted and is_open(award.job, "waiting", "awarded"):
+            reason = f"'{history.arm}' has permission to commit from another auctioneer, '{award.auctioneer}'."
+            terms = (award.award, history.arm, "unfinished", award.cycles, book.time_s, reason)
+            lost = JobOutcome(award.job.name, *terms)
+            if permitted and is_open(award.job, "waiting", "awarded") and book.is_news(lost):
                 records.append(JobsAccepted((award.job,), f"adopted from {history.arm}", book.time_s))
-                reason = f"'{history.arm}' has permission to commit from another auctioneer, '{award.auctioneer}'."
-                terms = (award.award, history.arm, "unfinished", award.cycles, book.time_s, reason)
-                records.append(JobSettled(JobOutcome(award.job.name, *terms)))
+                records.append(JobSettled(lost))
             continue
         states: tuple[JobState, ...] = ("waiting", "awarded") if permitted else ("waiting",)
         if (grant := book.open.get(award.award)) is not None:

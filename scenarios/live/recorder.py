@@ -221,7 +221,15 @@ class Recorder:
         begins = bool(series.epoch) and series.epoch not in count.epochs
         restarted = not series.continues and number <= count.last and (begins or time_s > count.time_s)
         if number <= count.last and not restarted:
-            return self._fill(series, count, time_s)
+            if self._fill(series, count, time_s):
+                return True
+            if not series.continues or time_s <= count.time_s:
+                count.twice += 1
+                return False
+            reason = "these numbers were used twice: the journal of the sender was replaced by an older copy"
+            repeated = Gap(series.sender, number, count.last, count.time_s, time_s, reason, series.epoch)
+            self._rows.append(repeated)
+            count.last = number - 1
         if begins:
             count.epochs += (series.epoch,)
         expected = series.first if restarted or series.first > count.last else count.last + 1
@@ -264,7 +272,6 @@ class Recorder:
                     self.missing.append(structs.replace(gap, first=number + 1, after_s=time_s))
                 count.kept, count.missed = count.kept + 1, count.missed - 1
                 return True
-        count.twice += 1
         return False
 
     @contextmanager

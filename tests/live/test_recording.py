@@ -195,6 +195,17 @@ def test_a_repeated_message_of_another_time_is_no_restart(tmp_path, make, table)
     assert read_parts(tmp_path, "gaps").num_rows == 0
 
 
+@pytest.mark.parametrize("make", [result, operation])
+def test_numbers_that_an_older_copy_of_the_journal_uses_again_are_kept_and_named(tmp_path, make):
+    """The sender repeats first what the copy has."""
+    before, again = [make(number) for number in range(5)], [replace(make(n), time_s=20.0 + n) for n in (3, 4, 5)]
+    recorder = recorded(tmp_path, *before, before[1], before[2], *again, *again, status="finished")
+    assert sorted(map(repr, open_messages(tmp_path))) == sorted(map(repr, [*before, *again]))
+    (gap,) = read_parts(tmp_path, "gaps").to_pylist()
+    assert (gap["first"], gap["last"], gap["time_s"], "older copy" in gap["reason"]) == (3, 4, 23.0, True)
+    assert recorder.missing == []
+
+
 def test_a_part_that_a_crash_left_without_its_card_is_not_read_later(tmp_path):
     """The next part of the same number has no operations; the message then comes again."""
     before = Recorder.open(tmp_path, "f")
