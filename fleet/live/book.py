@@ -15,6 +15,8 @@ roster (`fleet.live.consensus.grants`). The rules that make it safe (`fleet.bus.
   reports such a job as unfinished, by its own grants or those of its peers.
 - A settled job is granted to no arm, a cancelled one only to the arm that has permission to commit.
 - After a crash every open grant counts as leased from the restart.
+- A job that an arm may have done, by its report or history, is unfinished, also under an award that is not known here.
+  So is one whose arm was restarted without the permission to commit that it was given.
 - A grant without permission to commit also ends when an arm has finished the job, or, if an older copy of the journal
   has it (`fleet.live.epochs`), when an arm has permission to commit under another grant.
 - An arm takes the space of a grant until a later quote or claim of the arm states that it does not. Of two plans that

@@ -4,6 +4,10 @@ The epoch is the name of a journal of the auctioneer, which arms get with every 
 counts as present, the auctioneer asks what it has finished and what it has. If an arm knows another epoch, the journal
 was lost: no jobs are accepted, unless a new epoch was requested. Then the auctioneer adopts what the arms know.
 
+An older copy of the journal lacks what was done since. So after a restart no job is awarded until all arms have told
+what they have finished, what they have, and what they may have done: such a job is unfinished, and a person settles it.
+The auctioneer waits for at most 20 s: what only an arm knows that comes online later may be done again.
+
 Without an auctioneer all arms keep one epoch. An arm whose journals are lost has forgotten what it granted and what was
 done: it does not take part beside arms that know it, unless a person requests it (`--new-epoch`). Then it adopts what
 the present arms have done and have. An arm takes part only after a majority, with itself, has replied with its history.

@@ -315,7 +315,7 @@ class Report(FiniteStruct, frozen=True):
     """With `returned`: the arm faulted in this job. After two faults of one arm, or three of all arms, the job becomes
     `given_up`."""
     restarted: bool = False
-    """With `returned`: by the journal of the arm, at its start. If it had permission to commit, it counts as unsure."""
+    """With `returned`: at a restart. Unsure if the arm had permission to commit."""
 
 
 class Receipt(msgspec.Struct, frozen=True):

@@ -166,8 +166,7 @@ class History(msgspec.Struct, frozen=True):
     claims: Annotated[dict[Name, Count], msgspec.Meta(max_length=MOST_JOBS)] = {}
     """Number of the last claim of each arm, where arms allocate jobs without an auctioneer."""
     committed: Annotated[tuple[JobOutcome, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
-    """Likewise: jobs of arms with permission to commit; unfinished if an arm has lost its journal. With an auctioneer:
-    jobs that the arm has reported as unsure."""
+    """Unfinished: jobs reported as unsure. Without an auctioneer, jobs of arms with permission to commit."""
     time_s: Number = 0.0
     """Fleet time of `epoch` by the arm's clock; 0 for unknown. An auctioneer that restarts continues from it."""
 

@@ -12,6 +12,8 @@ of the arm:
   answer is on disk before it is sent;
 - the arm begins cycles up to `allowed_cycles`: only under a valid lease, the last one only with permission to commit,
   which is on disk before; it ends what it has begun, and begins nothing of a revoked award;
+- an arm that is stopped returns no award whose last cycle may have begun;
+- the last jobs that it has finished, or may have done, stay in its history after the reports are acknowledged;
 - the end of a job is on disk before it is reported, and the report is repeated until it is acknowledged.
 """
 
