@@ -116,7 +116,10 @@ def _sure(after: Any) -> Any:
 
     def patched(self: Any, arm: str, time_s: float) -> Any:
         history = after(self, arm, time_s)
-        history.reports = {name: (award, changed(r, unsure=False)) for name, (award, r) in history.reports.items()}
+        history.reports = {
+            name: (award, changed(report, unsure=False, restarted=False))
+            for name, (award, report) in history.reports.items()
+        }
         return history
 
     return patched
