@@ -68,6 +68,8 @@ class EpochCheck:
         self._hold_until_s = time.monotonic() + hold_s
         self._foreign: dict[str, str] = {}
         """Why the history of an arm does not fit, by arm."""
+        self.unreadable: dict[str, str] = {}
+        """Why the history of an arm cannot be read, by arm: it gets no jobs."""
 
     @property
     def objection(self) -> str:
@@ -93,6 +95,7 @@ class EpochCheck:
         """Forget an arm that has left: it may come back with another history."""
         self._admitted.discard(arm)
         self._foreign.pop(arm, None)
+        self.unreadable.pop(arm, None)
         self._asked_s.pop(arm, None)
 
     def _ask(self, arm: str) -> None:
@@ -105,13 +108,15 @@ class EpochCheck:
             if "" in replies.refused.values():  # it did not reply in time
                 return
             for reason in replies.refused.values():
-                remedy = "Update it; or stop it, and jobs that only it knows as done may be done again"
-                self._object(arm, f"the history of '{arm}' cannot be read ({reason}). {remedy}.")
+                if arm not in self.unreadable:
+                    self.unreadable[arm] = f"has a history that cannot be read ({reason.rstrip('.')})"
+                    _LOG.error("'%s' %s: it gets no jobs. Update it.", arm, self.unreadable[arm])
                 return
             for history in replies.messages.values():
                 if not self._accept(history):
                     return
             self._foreign.pop(arm, None)
+            self.unreadable.pop(arm, None)
             self._admitted.add(arm)  # an arm of another maker may have no history
             self._replied.add(arm)
 
@@ -123,8 +128,12 @@ class EpochCheck:
         """Adopt what an arm knows; return whether it fits and is on disk."""
         book = self._auctioneer.book
         if history.epoch not in ("", book.epoch) and not book.succeeds:
-            what = f"the journal has the epoch '{book.epoch}', but {describe(history)}"
-            self._object(history.arm, f"{what}. {REMEDY} Or stop '{history.arm}', if it alone is wrong.")
+            if history.arm not in self._foreign:
+                self._foreign[history.arm] = (
+                    f"No jobs are accepted or awarded: the journal has the epoch '{book.epoch}', but "
+                    f"{describe(history)}. {REMEDY} Or stop '{history.arm}', if it alone is wrong."
+                )
+                _LOG.error("%s", self._foreign[history.arm])
             return False
         try:
             self._auctioneer.adopt(history, time.monotonic())
@@ -132,11 +141,6 @@ class EpochCheck:
             _LOG.error("The history of '%s' is not recorded: %s", history.arm, error)
             return False
         return True
-
-    def _object(self, arm: str, reason: str) -> None:
-        if arm not in self._foreign:
-            self._foreign[arm] = f"No jobs are accepted or awarded: {reason}"
-            _LOG.error("%s", self._foreign[arm])
 
 
 HOLD_S = 20.0
@@ -350,7 +354,7 @@ class AuctionNode(JobDesk):
             for arm, count in self._late.items()
             if count >= MOST_UNANSWERED
         }
-        return {**late, **self.auctioneer.rounds.back_offs.unanswering}
+        return {**late, **self.auctioneer.rounds.back_offs.unanswering, **self._epochs.unreadable}
 
     def _submit(self, submission: Submission) -> SubmissionReply:
         return self._accept_jobs(submission, self._reserved)

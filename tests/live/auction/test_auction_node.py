@@ -424,10 +424,10 @@ def test_an_auctioneer_of_another_name_leaves_a_last_cycle_in_progress_unfinishe
     assert (fleet.begun, fleet.states("a")) == ({"a": 1}, {"unfinished"})
 
 
-@pytest.mark.parametrize("case", ["late", "absent", "unreadable"])
+@pytest.mark.parametrize("case", ["late", "absent"])
 def test_an_older_copy_awards_nothing_before_all_arms_have_told_what_they_have_done(fleet_of, monkeypatch, case):
     fleet, copy, arm = begun_after_copy(fleet_of, job("a", 1, **LONG))
-    others, updated = [each for each in fleet.arms if each != arm], list[str]()
+    others = [each for each in fleet.arms if each != arm]
     fleet.until(lambda: fleet.is_everywhere("a", "finished"))
     fleet.run(3.0)
     if case == "absent":
@@ -436,24 +436,16 @@ def test_an_older_copy_awards_nothing_before_all_arms_have_told_what_they_have_d
         restore(fleet, copy)
         for each in others:
             fleet.world.processes[each].start()
-    elif case == "late":
+    else:
         with monkeypatch.context() as before:
             before.setattr(fleet.world, "send", fleet.world.send)
             fleet.lose(f"{arm}/history")
             restore(fleet, copy)
             fleet.run(3.0)
-    else:
-        fleet.intercept(arm, "history", lambda request, reply_to: (reply_to if updated else malformed)(request))
-        restore(fleet, copy)
     fleet.until(lambda: bool(boss(fleet)._epochs._replied))
     fleet.run(3.0)
     assert arm in fleet.status("a").reason
-    if case == "unreadable":
-        fleet.run(30.0)
-        assert f"the history of '{arm}' cannot be read (Not a" in refused(lambda: fleet.submit(job("b")))
-        assert boss(fleet)._trouble() == fleet.status("a").reason
-        updated.append(arm)
-    elif case == "absent":
+    if case == "absent":
         fleet.world.processes[arm].start()
     fleet.until(lambda: fleet.is_everywhere("a", "finished"))
     fleet.submit(job("b", 1))
@@ -471,6 +463,20 @@ def test_an_auctioneer_waits_for_an_arm_that_stays_away_a_limited_time(fleet_of)
     fleet.until(lambda: "have been done by arm_1, arm_2." in fleet.status("b").reason)
     fleet.until(lambda: fleet.is_everywhere("b", "finished"))
     assert HOLD_S < fleet.world.now_s - start_s < HOLD_S + 5.0
+
+
+def test_an_arm_with_a_malformed_history_stops_no_other_and_is_named(fleet_of):
+    fleet, updated = fleet_of(alone=False), list[str]()
+    fleet.intercept("arm_0", "history", lambda request, reply_to: (reply_to if updated else malformed)(request))
+    fleet.auctioneer()
+    fleet.submit(job("a", 1))
+    fleet.until(lambda: fleet.is_everywhere("a", "finished"))
+    status = fleet.ask(STATUS, StatusRequest(), Status)
+    assert "has a history that cannot be read (Not a" in status.left_out["arm_0"]
+    assert "arm_0" not in boss(fleet).auctioneer.rounds.present
+    updated.append("arm_0")
+    fleet.until(lambda: "arm_0" in boss(fleet).auctioneer.rounds.present)
+    assert fleet.ask(STATUS, StatusRequest(), Status).left_out == {}
 
 
 def test_fleet_time_continues_as_the_arms_have_kept_it_while_there_was_no_auctioneer(fleet_of):
