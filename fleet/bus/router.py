@@ -22,7 +22,7 @@ from fleet.bus.protocol.messages import MOST_BYTES
 from fleet.bus.protocol.policy import MOST_REQUEST_BYTES
 from fleet.bus.security.access_control import ROSTER, Roster, RosterEntry, access_control, read_roster
 from fleet.bus.security.tls import Tls, identified, participant_at, try_connection
-from fleet.errors import BusError, NoRouter, StoppedWaiting
+from fleet.errors import BusError, NoRouter, StoppedWaiting, listed
 
 _LOG = logging.getLogger(__name__)
 
@@ -469,6 +469,14 @@ def fleets_at(endpoint: str, *, timeout_s: float = 5.0) -> tuple[str, ...]:
             if (parsed := keys.parse(key)).role != "monitor":
                 fleets.add(parsed.fleet)
     return tuple(sorted(fleets))
+
+
+def warn_of_absence(fleet: str, endpoint: str) -> None:
+    """Log it if no participant of this fleet is online: its name may be mistyped. With TLS this is not known."""
+    with suppress(BusError):  # the router ends at this moment, and may be back
+        if identified(endpoint)[1] is None and fleet not in (fleets := fleets_at(endpoint)):
+            there = f"Fleets at {endpoint}: {listed(fleets)}."
+            _LOG.warning("No participant of the fleet '%s' is online yet. %s", fleet, there)
 
 
 def other_versions(endpoint: str, fleet: str, *, timeout_s: float = 2.0) -> tuple[str, ...]:

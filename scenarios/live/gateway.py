@@ -60,7 +60,7 @@ from fleet.bus.protocol.operator import (
     check_request,
     without_reset,
 )
-from fleet.bus.router import fleets_at
+from fleet.bus.router import warn_of_absence
 from fleet.bus.security.access_control import RosterEntry, rights_by_role
 from fleet.bus.security.tls import participant_at
 from fleet.env.render.heat import heat_scale
@@ -725,22 +725,10 @@ def run_gateway(
         with until_stopped() as stop:
             link = BusClient(endpoint, name, stopped=stop.is_set).open()
         with link:
-            with suppress(BusError):  # the router ends at this moment, and may be back
-                warn_of_absence(name, endpoint)
+            warn_of_absence(name, endpoint)
             number = asyncio.run(serve(link, bound, roles, page, kept=kept, hooks=hooks))
     if number == signal.SIGINT:
         raise Interrupted("The gateway was interrupted.")
-
-
-def warn_of_absence(fleet: str, endpoint: str) -> None:
-    """Log it if no participant of this fleet is online: its name may be mistyped.
-
-    Raises:
-        BusError: no router replies.
-    """
-    if fleet not in (fleets := fleets_at(endpoint)):
-        there = f"Fleets at {endpoint}: {listed(fleets)}."
-        _LOG.warning("No participant of the fleet '%s' is online yet. %s", fleet, there)
 
 
 def permitted_role(fleet: str, participant: RosterEntry | None, tokens: Mapping[str, Role]) -> Role:
