@@ -798,3 +798,42 @@ def test_a_break_after_the_due_date_is_no_reason_to_be_late() -> None:
     )
     assert "break" not in after
     assert before.endswith("arm_a had a break.")
+
+
+def of_card(log: ShiftLog, **card: Any) -> ShiftLog:
+    """A shift with changes to its card."""
+    return replace(log, card={**log.card, **card})
+
+
+PLAIN = shift(card={"scenario": {"name": "busy"}, "scenario_hash": "1a", "seed": 3}, jobs=(record("a", 840.0),))
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        (PLAIN, "nothing. All have the same jobs."),
+        (of_card(PLAIN, scenario_hash="2b"), "content of the scenario. All have the same jobs."),
+        (
+            of_card(replace(PLAIN, jobs=(record("a", 900.0),)), scenario_hash="2b"),
+            "content of the scenario and jobs. They have other jobs: their figures compare no policies.",
+        ),
+        (
+            of_card(PLAIN, scenario={"name": "copy"}, scenario_hash="2b", policy="edd"),
+            "scenario and policy. All have the same jobs.",
+        ),
+        (
+            of_card(replace(PLAIN, jobs=(record("a", 840.0), record("b", 840.0))), seed=4),
+            "seed and jobs. They have other jobs: their figures compare no policies.",
+        ),
+        (of_card(PLAIN, code_hash="3c"), "code. All have the same jobs."),
+    ],
+    ids=["equal", "an arm was moved", "another table", "another file", "another seed", "another version"],
+)
+def test_runs_have_the_same_jobs_by_their_jobs_and_the_same_scenario_by_its_content(other: ShiftLog, said: str) -> None:
+    page = runs_page({"one": replace(PLAIN), "other": replace(other)})
+    assert f"The runs differ in {said}" in page
+
+
+def test_jobs_that_finished_at_other_times_are_the_same_jobs() -> None:
+    later = replace(PLAIN, jobs=(replace(PLAIN.jobs[0], finished_s=None, state="waiting"),))
+    assert "All have the same jobs." in runs_page({"one": PLAIN, "other": later})
