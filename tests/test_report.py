@@ -511,8 +511,9 @@ RELEASE, LATE = event(0.0, "release", job="long-1"), done("long-1", 600, 900, 60
     ("before", "temp_c", "reason"),
     [
         ((*done("short-1", 0, 200), *done("short-2", 200, 400), *done("long-2", 400, 590)), 30.0,
-         "3 other jobs went first on arm_a, 2 of them shorter"),
-        (done("long-2", -10, 590), 30.0, "arm_a was at work since before its release"),
+         "3 other jobs went first on arm_a, 2 of them shorter; at 0:06:40, still in time, arm_a began long-2"),
+        (done("long-2", -10, 590), 30.0,
+         "arm_a was at work since before its release; no arm was free by 0:09:00, its latest begin"),
         (OUT, 30.0, "arm_a was out after a fault"),
         (FAULTED, 30.0, "arm_a faulted during it at 0:02:30"),
         ((), 62.0, "arm_a was idle above the warning limit"),
@@ -790,14 +791,79 @@ def test_the_temperatures_tell_a_failure_from_a_fault() -> None:
 
 def test_a_break_after_the_due_date_is_no_reason_to_be_late() -> None:
     pause = event(300.0, "break", job="", value=600.0), event(900.0, "break_end", job="")
-    events = (event(0.0, "release", job="late-1"), *done("other-1", 1.0, 250.0), *pause)
     offers = (offered("late-1", 1.0, 100.0), offered("other-1", 1.0, 249.0))
     after, before = (
-        why_late(shift(*events, jobs=(record("late-1", due_s, "waiting"), record("other-1", 900.0)), offers=offers))
-        for due_s in (200.0, 400.0)
+        why_late(
+            shift(
+                *done("other-1", 1.0, 250.0),
+                *pause,
+                jobs=(replace(record("late-1", due_s, "waiting"), release_s=release_s), record("other-1", 900.0)),
+                offers=offers,
+            )
+        )
+        for release_s, due_s in ((0.0, 200.0), (300.0, 500.0))
     )
     assert "break" not in after
-    assert before.endswith("arm_a had a break.")
+    assert before.endswith("arm_a had a break; no arm was free by 0:06:40, its latest begin.")
+
+
+def late_beside(*events: Event, lengths_s: dict[str, float], due_s: float = 840.0, card: Any = None) -> str:
+    """What is said of `long-1`, which takes 300 s, was released at 0 s, and began 10 min later."""
+    every = (RELEASE, *events, *done("long-1", 600, 900, 900 - due_s))
+    awards = [each for each in every if each.kind == "award"]
+    offers = [replace(offered(e.job, e.time_s, lengths_s.get(e.job, 300.0)), arm=e.arm) for e in awards]
+    jobs = [replace(record(each.job, due_s), payload_kg=0.2) for each in awards]
+    log = shift(*every, temp_c=30.0, jobs=tuple(jobs), offers=tuple(offers), card={"scenario": card or {}})
+    text = lateness_text(log, [each for each in late_jobs(log) if each.job == "long-1"])
+    return text.removeprefix("long-1 finished 1 min late: ")
+
+
+def test_an_arm_that_was_free_in_time_and_began_another_job_is_the_reason_however_long_it_was_at_work_before() -> None:
+    """The job is due at 0:14:00 and takes 5 min: until 0:09:00 its begin is in time."""
+    at_work = "arm_a was at work since before its release; no arm was free by 0:09:00, its latest begin"
+    for free_s, reason in (
+        (539.0, "at 0:08:59, still in time, arm_a was free and began long-3 instead."),
+        (541.0, f"{at_work}; then 1 other job went first on arm_a, which was shorter."),
+    ):
+        before = (*done("long-2", -10, free_s), *done("long-3", free_s, 599))
+        assert late_beside(*before, lengths_s={"long-3": 58.0}) == reason
+
+
+def test_work_that_differs_by_less_than_a_hundredth_is_not_shorter() -> None:
+    before = (*done("long-2", 0, 280), *done("long-3", 280, 590))
+    for length_s, trait in ((299.98, ""), (290.0, ", all of them shorter")):
+        reason = late_beside(*before, lengths_s={"long-2": length_s, "long-3": length_s})
+        assert reason == f"2 other jobs went first on arm_a{trait}; at 0:04:40, still in time, arm_a began long-3."
+
+
+def test_another_job_is_no_reason_if_the_arm_had_a_break_before_the_late_one_was_finished() -> None:
+    before = (*done("short-1", 0, 200), event(200.0, "break", job="", value=380.0), event(580.0, "break_end", job=""))
+    assert "short-1" not in late_beside(*before, lengths_s={"short-1": 200.0})
+
+
+def test_another_job_is_no_reason_while_a_third_one_has_the_place_of_the_late_one() -> None:
+    rows = [row_of_table("long-1"), row_of_table("third") | {"places": [["a", "c"]]}, row_of_table("short-1")]
+    before = (*done("third", -10, 550, arm="arm_b"), *done("short-1", 100, 300))
+    lengths_s = {"short-1": 200.0, "third": 560.0}
+    free = late_beside(*before, lengths_s=lengths_s)
+    assert free == "at 0:01:40, still in time, arm_a was free and began short-1 instead."
+    assert "in time" not in late_beside(*before, lengths_s=lengths_s, card={"jobs": rows})
+
+
+def test_a_predecessor_that_finished_in_time_is_no_reason() -> None:
+    """A1 took most of the wait of A2, but A2, which takes 5 min and is due at 0:15:00, could have begun then."""
+    for finished_s, reason in (
+        (599.0, "at 0:09:59, still in time, arm_a was free and began B1 instead."),
+        (
+            601.0,
+            "it waited for A1, which finished at 0:10:01; then 1 other job went first on arm_a, which was shorter.",
+        ),
+    ):
+        events = (*done("A1", 0, finished_s), *done("B1", finished_s, 700), *done("A2", 700, 1000, 100.0))
+        jobs = (replace(record("A1", 2000.0), finished_s=finished_s), record("A2", 900.0), record("B1", 2000.0))
+        offers = (offered("A1", 0.0, 600.0), offered("B1", finished_s, 100.0), offered("A2", 700.0, 300.0))
+        log = shift(*events, temp_c=30.0, samples=1200, card={"scenario": IN_ORDER}, jobs=jobs, offers=offers)
+        assert why_late(log) == f"A2 finished 1 min 40 s late: {reason}"
 
 
 def of_card(log: ShiftLog, **card: Any) -> ShiftLog:
