@@ -732,9 +732,21 @@ def test_a_job_that_came_back_for_a_break_or_a_failure_is_late_by_that(kind: str
 
 
 def test_a_job_that_is_given_up_with_another_one_says_so() -> None:
-    events = (event(0.0, "release", job="a"), event(300.0, "give_up", "", "a", reason="a job before it was given up"))
+    reason = "it waited for b, which was given up"
+    events = (event(0.0, "release", job="a"), event(300.0, "give_up", "", "a", reason=reason))
     log = shift(*events, jobs=(record("a", 500.0, "given_up"),))
-    assert why_late(log).endswith(": a job before it was given up.")
+    assert why_late(log).endswith(f": {reason}.")
+    assert why_late(replace(log, events=())).endswith(": a job that it waited for was abandoned.")
+
+
+@pytest.mark.parametrize(("state", "how"), [("expired", "expired"), ("given_up", "was given up")])
+def test_a_job_that_is_given_up_with_another_one_names_it_also_without_the_reason(state: str, how: str) -> None:
+    card = {"scenario": {"jobs": [row_of_table("A0"), row_of_table("A1"), row_of_table("A2", "A0", "A1")]}}
+    jobs = (record("A0", 900.0, "waiting"), record("A1", 2000.0, state), record("A2", 500.0, "given_up"))
+    events = (event(300.0, "give_up", "", "A2", reason="a job before it was given up"),)  # as earlier versions have it
+    log = shift(*events, card=card, jobs=jobs)
+    (late,) = (each for each in late_jobs(log) if each.job == "A2")
+    assert lateness_text(log, [late]).endswith(f": it waited for A1, which {how}.")
 
 
 def test_an_empty_list_of_a_card_is_none() -> None:
@@ -742,7 +754,7 @@ def test_an_empty_list_of_a_card_is_none() -> None:
 
 
 def test_the_event_table_has_jobs_that_were_given_up() -> None:
-    why = "a job before it was given up"
+    why = "it waited for hold-000, which expired"
     text = page(events=(Event(time_s=9.0, kind="give_up", arm="", job="hold-001", reason=why),))
     assert f"<td>job given up</td><td></td><td>hold-001</td><td>{why}</td>" in text
     assert "1 × job given up" in text

@@ -20,6 +20,8 @@ MOST_LATE = 50
 SAME = 0.01
 """Times of work that differ by at most this share count as equal."""
 PAUSED = "had a break"
+ABANDONED = ("given_up", "expired")
+"""States of jobs that left the queue unfinished."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +116,7 @@ class LateJob:
     @property
     def abandoned(self) -> bool:
         """Whether it left the queue unfinished."""
-        return self.state in ("given_up", "expired")
+        return self.state in ABANDONED
 
 
 def late_jobs(log: ShiftLog) -> list[LateJob]:
@@ -176,7 +178,10 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
             return how if span.faulted else f"{how}{_return_reason(log, span)}"
     if late.state == "given_up" and not own:
         why = next((e.reason for e in log.events if e.kind == "give_up" and e.job == late.job), "")
-        return why or "a job before it was given up"
+        lost = next((each for each in log.jobs_before.get(late.job, ()) if each.state in ABANDONED), None)
+        if lost is not None:
+            return f"it waited for {lost.job}, which {'expired' if lost.state == 'expired' else 'was given up'}"
+        return why or "a job that it waited for was abandoned"
     begin_s = next((job.release_s for job in log.jobs if job.job == late.job), math.nan)
     if math.isnan(begin_s):
         return "its release is not recorded"
