@@ -753,6 +753,12 @@ def test_an_empty_list_of_a_card_is_none() -> None:
     assert value_text({"loss": 0.0, "partitions": []}) == "loss 0, partitions none"
 
 
+def test_the_settings_give_the_seed_of_a_twin_without_a_separator_at_its_end() -> None:
+    twin = {"version": "ab12", "seed": "[0, 1]/"}
+    text = report_html(shift(card={"twins": {"arm_a": {"version": "d:ab12", "twin": twin}}}))
+    assert "version d:ab12, twin version ab12, seed [0, 1]<" in text
+
+
 def test_the_event_table_has_jobs_that_were_given_up() -> None:
     why = "it waited for hold-000, which expired"
     text = page(events=(Event(time_s=9.0, kind="give_up", arm="", job="hold-001", reason=why),))

@@ -222,8 +222,7 @@ def thread_table(thread: Thread) -> Table:
     if thread.twin:
         row("twin", *_pairs({k: v for k, v in thread.twin.items() if not isinstance(v, Mapping)}))
         if "twin" in thread.twin:
-            twin = thread.twin["twin"]
-            row("trained on", *_pairs(twin | {"seed": twin["seed"].rstrip("/")} if "seed" in twin else twin))
+            row("trained on", value_text({key.replace("_", " "): each for key, each in thread.twin["twin"].items()}))
     row("configuration", *_pairs({k: v for k, v in thread.configuration.items() if k != "channel"}))
     if isinstance(channel := thread.configuration.get("channel"), Mapping):
         row("channel", *_pairs(channel))
