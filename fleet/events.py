@@ -50,7 +50,9 @@ MEANINGS: dict[EventKind, Meaning] = {
     "return": Meaning(
         "The job is open again: the arm faulted, or had to return it.", "cycles that are kept", live=True
     ),
-    "give_up": Meaning("Arms faulted in the job too often, or a job before it was given up: it is abandoned."),
+    "give_up": Meaning(
+        "The job is abandoned: arms faulted in it too often, or a job that it waited for was abandoned."
+    ),
     "give_back": Meaning("The arm returned its job after a cycle.", "cycles that are kept"),
     "expire": Meaning("The due date passed while the job waited, begun before or not: it is abandoned."),
     "recover": Meaning("The fault is cleared.", live=True),

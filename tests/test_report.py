@@ -511,8 +511,9 @@ RELEASE, LATE = event(0.0, "release", job="long-1"), done("long-1", 600, 900, 60
     ("before", "temp_c", "reason"),
     [
         ((*done("short-1", 0, 200), *done("short-2", 200, 400), *done("long-2", 400, 590)), 30.0,
-         "3 other jobs went first on arm_a, 2 of them shorter"),
-        (done("long-2", -10, 590), 30.0, "arm_a was at work since before its release"),
+         "3 other jobs went first on arm_a, 2 of them shorter; at 0:06:40, still in time, arm_a began long-2"),
+        (done("long-2", -10, 590), 30.0,
+         "arm_a was at work since before its release; no arm was free by 0:09:00, its latest begin"),
         (OUT, 30.0, "arm_a was out after a fault"),
         (FAULTED, 30.0, "arm_a faulted during it at 0:02:30"),
         ((), 62.0, "arm_a was idle above the warning limit"),
@@ -731,17 +732,35 @@ def test_a_job_that_came_back_for_a_break_or_a_failure_is_late_by_that(kind: str
 
 
 def test_a_job_that_is_given_up_with_another_one_says_so() -> None:
-    events = (event(0.0, "release", job="a"), event(300.0, "give_up", "", "a", reason="a job before it was given up"))
+    reason = "it waited for b, which was given up"
+    events = (event(0.0, "release", job="a"), event(300.0, "give_up", "", "a", reason=reason))
     log = shift(*events, jobs=(record("a", 500.0, "given_up"),))
-    assert why_late(log).endswith(": a job before it was given up.")
+    assert why_late(log).endswith(f": {reason}.")
+    assert why_late(replace(log, events=())).endswith(": a job that it waited for was abandoned.")
+
+
+@pytest.mark.parametrize(("state", "how"), [("expired", "expired"), ("given_up", "was given up")])
+def test_a_job_that_is_given_up_with_another_one_names_it_also_without_the_reason(state: str, how: str) -> None:
+    card = {"scenario": {"jobs": [row_of_table("A0"), row_of_table("A1"), row_of_table("A2", "A0", "A1")]}}
+    jobs = (record("A0", 900.0, "waiting"), record("A1", 2000.0, state), record("A2", 500.0, "given_up"))
+    events = (event(300.0, "give_up", "", "A2", reason="a job before it was given up"),)  # as earlier versions have it
+    log = shift(*events, card=card, jobs=jobs)
+    (late,) = (each for each in late_jobs(log) if each.job == "A2")
+    assert lateness_text(log, [late]).endswith(f": it waited for A1, which {how}.")
 
 
 def test_an_empty_list_of_a_card_is_none() -> None:
     assert value_text({"loss": 0.0, "partitions": []}) == "loss 0, partitions none"
 
 
+def test_the_settings_give_the_seed_of_a_twin_without_a_separator_at_its_end() -> None:
+    twin = {"version": "ab12", "seed": "[0, 1]/"}
+    text = report_html(shift(card={"twins": {"arm_a": {"version": "d:ab12", "twin": twin}}}))
+    assert "version d:ab12, twin version ab12, seed [0, 1]<" in text
+
+
 def test_the_event_table_has_jobs_that_were_given_up() -> None:
-    why = "a job before it was given up"
+    why = "it waited for hold-000, which expired"
     text = page(events=(Event(time_s=9.0, kind="give_up", arm="", job="hold-001", reason=why),))
     assert f"<td>job given up</td><td></td><td>hold-001</td><td>{why}</td>" in text
     assert "1 × job given up" in text
@@ -790,11 +809,115 @@ def test_the_temperatures_tell_a_failure_from_a_fault() -> None:
 
 def test_a_break_after_the_due_date_is_no_reason_to_be_late() -> None:
     pause = event(300.0, "break", job="", value=600.0), event(900.0, "break_end", job="")
-    events = (event(0.0, "release", job="late-1"), *done("other-1", 1.0, 250.0), *pause)
     offers = (offered("late-1", 1.0, 100.0), offered("other-1", 1.0, 249.0))
     after, before = (
-        why_late(shift(*events, jobs=(record("late-1", due_s, "waiting"), record("other-1", 900.0)), offers=offers))
-        for due_s in (200.0, 400.0)
+        why_late(
+            shift(
+                *done("other-1", 1.0, 250.0),
+                *pause,
+                jobs=(replace(record("late-1", due_s, "waiting"), release_s=release_s), record("other-1", 900.0)),
+                offers=offers,
+            )
+        )
+        for release_s, due_s in ((0.0, 200.0), (300.0, 500.0))
     )
     assert "break" not in after
-    assert before.endswith("arm_a had a break.")
+    assert before.endswith("arm_a had a break; no arm was free by 0:06:40, its latest begin.")
+
+
+def late_beside(*events: Event, lengths_s: dict[str, float], due_s: float = 840.0, card: Any = None) -> str:
+    """What is said of `long-1`, which takes 300 s, was released at 0 s, and began 10 min later."""
+    every = (RELEASE, *events, *done("long-1", 600, 900, 900 - due_s))
+    awards = [each for each in every if each.kind == "award"]
+    offers = [replace(offered(e.job, e.time_s, lengths_s.get(e.job, 300.0)), arm=e.arm) for e in awards]
+    jobs = [replace(record(each.job, due_s), payload_kg=0.2) for each in awards]
+    log = shift(*every, temp_c=30.0, jobs=tuple(jobs), offers=tuple(offers), card={"scenario": card or {}})
+    text = lateness_text(log, [each for each in late_jobs(log) if each.job == "long-1"])
+    return text.removeprefix("long-1 finished 1 min late: ")
+
+
+def test_an_arm_that_was_free_in_time_and_began_another_job_is_the_reason_however_long_it_was_at_work_before() -> None:
+    """The job is due at 0:14:00 and takes 5 min: until 0:09:00 its begin is in time."""
+    at_work = "arm_a was at work since before its release; no arm was free by 0:09:00, its latest begin"
+    for free_s, reason in (
+        (539.0, "at 0:08:59, still in time, arm_a was free and began long-3 instead."),
+        (541.0, f"{at_work}; then 1 other job went first on arm_a, which was shorter."),
+    ):
+        before = (*done("long-2", -10, free_s), *done("long-3", free_s, 599))
+        assert late_beside(*before, lengths_s={"long-3": 58.0}) == reason
+
+
+def test_work_that_differs_by_less_than_a_hundredth_is_not_shorter() -> None:
+    before = (*done("long-2", 0, 280), *done("long-3", 280, 590))
+    for length_s, trait in ((299.98, ""), (290.0, ", all of them shorter")):
+        reason = late_beside(*before, lengths_s={"long-2": length_s, "long-3": length_s})
+        assert reason == f"2 other jobs went first on arm_a{trait}; at 0:04:40, still in time, arm_a began long-3."
+
+
+def test_another_job_is_no_reason_if_the_arm_had_a_break_before_the_late_one_was_finished() -> None:
+    before = (*done("short-1", 0, 200), event(200.0, "break", job="", value=380.0), event(580.0, "break_end", job=""))
+    assert "short-1" not in late_beside(*before, lengths_s={"short-1": 200.0})
+
+
+def test_another_job_is_no_reason_while_a_third_one_has_the_place_of_the_late_one() -> None:
+    rows = [row_of_table("long-1"), row_of_table("third") | {"places": [["a", "c"]]}, row_of_table("short-1")]
+    before = (*done("third", -10, 550, arm="arm_b"), *done("short-1", 100, 300))
+    lengths_s = {"short-1": 200.0, "third": 560.0}
+    free = late_beside(*before, lengths_s=lengths_s)
+    assert free == "at 0:01:40, still in time, arm_a was free and began short-1 instead."
+    assert "in time" not in late_beside(*before, lengths_s=lengths_s, card={"jobs": rows})
+
+
+def test_a_predecessor_that_finished_in_time_is_no_reason() -> None:
+    """A1 took most of the wait of A2, but A2, which takes 5 min and is due at 0:15:00, could have begun then."""
+    for finished_s, reason in (
+        (599.0, "at 0:09:59, still in time, arm_a was free and began B1 instead."),
+        (
+            601.0,
+            "it waited for A1, which finished at 0:10:01; then 1 other job went first on arm_a, which was shorter.",
+        ),
+    ):
+        events = (*done("A1", 0, finished_s), *done("B1", finished_s, 700), *done("A2", 700, 1000, 100.0))
+        jobs = (replace(record("A1", 2000.0), finished_s=finished_s), record("A2", 900.0), record("B1", 2000.0))
+        offers = (offered("A1", 0.0, 600.0), offered("B1", finished_s, 100.0), offered("A2", 700.0, 300.0))
+        log = shift(*events, temp_c=30.0, samples=1200, card={"scenario": IN_ORDER}, jobs=jobs, offers=offers)
+        assert why_late(log) == f"A2 finished 1 min 40 s late: {reason}"
+
+
+def of_card(log: ShiftLog, **card: Any) -> ShiftLog:
+    """A shift with changes to its card."""
+    return replace(log, card={**log.card, **card})
+
+
+PLAIN = shift(card={"scenario": {"name": "busy"}, "scenario_hash": "1a", "seed": 3}, jobs=(record("a", 840.0),))
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        (PLAIN, "nothing. All have the same jobs."),
+        (of_card(PLAIN, scenario_hash="2b"), "content of the scenario. All have the same jobs."),
+        (
+            of_card(replace(PLAIN, jobs=(record("a", 900.0),)), scenario_hash="2b"),
+            "content of the scenario and jobs. They have other jobs: their figures compare no policies.",
+        ),
+        (
+            of_card(PLAIN, scenario={"name": "copy"}, scenario_hash="2b", policy="edd"),
+            "scenario and policy. All have the same jobs.",
+        ),
+        (
+            of_card(replace(PLAIN, jobs=(record("a", 840.0), record("b", 840.0))), seed=4),
+            "seed and jobs. They have other jobs: their figures compare no policies.",
+        ),
+        (of_card(PLAIN, code_hash="3c"), "code. All have the same jobs."),
+    ],
+    ids=["equal", "an arm was moved", "another table", "another file", "another seed", "another version"],
+)
+def test_runs_have_the_same_jobs_by_their_jobs_and_the_same_scenario_by_its_content(other: ShiftLog, said: str) -> None:
+    page = runs_page({"one": replace(PLAIN), "other": replace(other)})
+    assert f"The runs differ in {said}" in page
+
+
+def test_jobs_that_finished_at_other_times_are_the_same_jobs() -> None:
+    later = replace(PLAIN, jobs=(replace(PLAIN.jobs[0], finished_s=None, state="waiting"),))
+    assert "All have the same jobs." in runs_page({"one": PLAIN, "other": later})

@@ -14,7 +14,7 @@ import numpy as np
 from fleet.bus.exchange.memory import Broadcast, Exchange, PeerView
 from fleet.engine import tables as event_numbers
 from fleet.engine.batch import Engine, Parts, RewardWeights, Shift, empty_parts
-from fleet.engine.state import State
+from fleet.engine.state import EXPIRED, GIVEN_UP, State
 from fleet.engine.tables import TRACE, EventBuffer
 from fleet.engine.world import World
 from fleet.events import Event, EventKind
@@ -240,7 +240,10 @@ def _described(
             kept = f"{state.cycles[e, j]} of {state.repetitions[e, j]} cycles kept"
             return "return" if kind == event_numbers.RETURN else "give_back", value, kept
         case event_numbers.GIVE_UP if value == event_numbers.FOLLOWS:
-            return "give_up", math.nan, "a job before it was given up"
+            before = [b for b in world.shifts[e].after[j].tolist() if b >= 0]
+            lost = next(b for b in before if state.status[e, b] in (GIVEN_UP, EXPIRED))
+            how = "expired" if state.status[e, lost] == EXPIRED else "was given up"
+            return "give_up", math.nan, f"it waited for {world.shifts[e].names[lost]}, which {how}"
         case event_numbers.GIVE_UP:
             return "give_up", value, f"{state.returns[e, j]} faults; {state.cycles[e, j]} cycles done"
         case event_numbers.MOVED:

@@ -4,6 +4,7 @@ import re
 from bisect import bisect
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from datetime import datetime
 from difflib import get_close_matches
 from math import isfinite
 from pathlib import Path
@@ -49,12 +50,15 @@ class Thread:
     configuration: Mapping[str, Any]
     code: Mapping[str, Any]
     """Hash of the code, and versions of the libraries."""
+    begin: datetime | None = None
+    """Date of the begin of the shift, for times of day; None if it is unknown."""
 
     def as_json(self) -> dict[str, Any]:
         """The thread as values for JSON, events without the env."""
         values = asdict(self)
         for event in filter(None, (values["event"], values["award"], *values["history"])):
             del event["env"]
+        del values["begin"]
         return values
 
 
@@ -107,6 +111,7 @@ def thread_of(folder: Path, asked: str) -> Thread:
         twin={"arm": arm} | dict(twins.get(arm) or {"version": stated or NOT_RECORDED}) if arm else {},
         configuration=scenario | {name: log.card.get(name, NOT_RECORDED) for name in CONFIGURATION},
         code={"hash": log.card.get("code_hash", NOT_RECORDED)} | log.card.get("versions", {}),
+        begin=log.begin,
     )
 
 
@@ -185,7 +190,7 @@ def rows_of(events: Sequence[Event], asked: str, untraced: Collection[str] = ())
 
 def thread_table(thread: Thread) -> Table:
     """The thread as a table without headings, about 30 lines."""
-    event = thread.event
+    event, begin = thread.event, thread.begin
     rows: list[tuple[str, str]] = []
 
     def row(name: str, *parts: object) -> None:
@@ -195,13 +200,17 @@ def thread_table(thread: Thread) -> Table:
     others = [str(each) for each in thread.alike if each != thread.row]
     alike = f"the first of {len(thread.alike)}, others in rows {', '.join(others[:5])}" if others else ""
     row("event", f"row {thread.row} of {thread.folder}", alike, "…" if len(others) > 5 else "")
-    row("", *_words(event), MEANINGS[event.kind].text.replace("`joint`", f"joint {event.joint}").replace("`", ""))
+    row(
+        "", *_words(event, begin), MEANINGS[event.kind].text.replace("`joint`", f"joint {event.joint}").replace("`", "")
+    )
     if thread.job:
-        row("job", *_pairs({name.removesuffix("_s"): _moment(name, value) for name, value in thread.job.items()}))
+        row(
+            "job", *_pairs({name.removesuffix("_s"): _moment(name, value, begin) for name, value in thread.job.items()})
+        )
     if thread.award is not None:
         award = thread.award
         d = f"d {award.value:.2f}" if award.value == award.value else ""
-        row("award", f"{clock(award.time_s)} to {award.arm}", d, award.reason)
+        row("award", f"{clock(award.time_s, begin)} to {award.arm}", d, award.reason)
         row("plan", *_plan(thread.offers, award))
     shown = sorted(thread.offers, key=lambda o: (not o.awarded, not o.free, o.arm))
     for i, offer in enumerate(shown[:MOST_OFFERS]):
@@ -213,7 +222,7 @@ def thread_table(thread: Thread) -> Table:
     if thread.twin:
         row("twin", *_pairs({k: v for k, v in thread.twin.items() if not isinstance(v, Mapping)}))
         if "twin" in thread.twin:
-            row("trained on", *_pairs(thread.twin["twin"]))
+            row("trained on", value_text({key.replace("_", " "): each for key, each in thread.twin["twin"].items()}))
     row("configuration", *_pairs({k: v for k, v in thread.configuration.items() if k != "channel"}))
     if isinstance(channel := thread.configuration.get("channel"), Mapping):
         row("channel", *_pairs(channel))
@@ -221,17 +230,17 @@ def thread_table(thread: Thread) -> Table:
     nearest_row = bisect([one.time_s for one in thread.history], event.time_s)
     first = max(0, min(nearest_row - MOST_HISTORY // 2, len(thread.history) - MOST_HISTORY))
     for i, one in enumerate(thread.history[first : first + MOST_HISTORY]):
-        row("" if i else "history", *_words(one))
-    caption = f"{event.kind.replace('_', ' ')} at {clock(event.time_s)}"
+        row("" if i else "history", *_words(one, begin))
+    caption = f"{event.kind.replace('_', ' ')} at {clock(event.time_s, begin)}"
     return Table(caption=caption, head=("", ""), rows=tuple(rows), numbers=False)
 
 
-def _words(event: Event) -> list[str]:
+def _words(event: Event, begin: datetime | None) -> list[str]:
     joint = f"joint {event.joint}" if event.joint else ""
     what, _, unit = (MEANINGS[event.kind].value or "value").partition(", ")
     value = f"{what} {event.value:.4g} {unit.split(';')[0]}".rstrip() if event.value == event.value else ""
     return [
-        clock(event.time_s),
+        clock(event.time_s, begin),
         event.kind.replace("_", " "),
         event.arm,
         event.job,
@@ -251,9 +260,9 @@ def _plan(offers: tuple[Offer, ...], award: Event) -> list[str]:
     return [f"plan {number}, the {'coolest' if number else 'fastest'} that was offered", duration]
 
 
-def _moment(name: str, value: object) -> object:
+def _moment(name: str, value: object, begin: datetime | None) -> object:
     """A value of a job, a time in seconds as a time of the shift."""
-    return clock(value) if name.endswith("_s") and isinstance(value, float) and isfinite(value) else value
+    return clock(value, begin) if name.endswith("_s") and isinstance(value, float) and isfinite(value) else value
 
 
 def _pairs(values: Mapping[str, Any]) -> list[str]:

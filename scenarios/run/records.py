@@ -412,18 +412,26 @@ class ShiftLog:
         return None if able is None else [arm for arm in self.arms if arm in able]
 
     @cached_property
-    def last_before(self) -> Mapping[str, tuple[JobRecord, float]]:
-        """Of each job that waits for others the one that finishes last, and its finish, s: infinite if unfinished."""
-        last = dict[str, tuple[JobRecord, float]]()
+    def jobs_before(self) -> Mapping[str, list[JobRecord]]:
+        """Of each job that waits for others these others."""
+        every = dict[str, list[JobRecord]]()
         for job in self.jobs:
             after = self.stream(job.job).get("after", ())
             if job.job not in self.streams:  # a row of a table has the name of its stream
                 number = job.job.rpartition("-")[2]
                 after = [name for each in after for name in (each, f"{each}-{number}")]
             before = [self.records[name] for name in after if name in self.records]
-            ends_s = [inf if each.finished_s is None else each.finished_s for each in before]
             if before:
-                last[job.job] = max(zip(before, ends_s, strict=True), key=lambda each: each[1])
+                every[job.job] = before
+        return every
+
+    @cached_property
+    def last_before(self) -> Mapping[str, tuple[JobRecord, float]]:
+        """Of each job that waits for others the one that finishes last, and its finish, s: infinite if unfinished."""
+        last = dict[str, tuple[JobRecord, float]]()
+        for job, before in self.jobs_before.items():
+            ends_s = [inf if each.finished_s is None else each.finished_s for each in before]
+            last[job] = max(zip(before, ends_s, strict=True), key=lambda each: each[1])
         return last
 
     def ready_s(self, job: JobRecord) -> float:

@@ -17,7 +17,11 @@ IDLE_S = 900.0
 """Time for which an arm without a job, beside a job that it can do, is worth a sentence."""
 MOST_LATE = 50
 """Rows of the table of late jobs."""
+SAME = 0.01
+"""Times of work that differ by at most this share count as equal."""
 PAUSED = "had a break"
+ABANDONED = ("given_up", "expired")
+"""States of jobs that left the queue unfinished."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +116,7 @@ class LateJob:
     @property
     def abandoned(self) -> bool:
         """Whether it left the queue unfinished."""
-        return self.state in ("given_up", "expired")
+        return self.state in ABANDONED
 
 
 def late_jobs(log: ShiftLog) -> list[LateJob]:
@@ -161,7 +165,8 @@ def late_table(log: ShiftLog) -> Table | None:
 
 
 def _reason(log: ShiftLog, late: LateJob) -> str:
-    """What delayed a job most: its own work, or what the arms that can do it did while it waited."""
+    """Why a job did not begin in time: its own work, a job before it, another job that an arm began in time instead, or
+    what the arms that can do it did until its latest begin."""
     own = sorted((span for span in log.plan.assignments if span.job == late.job), key=lambda span: span.start_s)
     for span in own:
         if span.outcome in ("returned", "given_up"):
@@ -173,29 +178,44 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
             return how if span.faulted else f"{how}{_return_reason(log, span)}"
     if late.state == "given_up" and not own:
         why = next((e.reason for e in log.events if e.kind == "give_up" and e.job == late.job), "")
-        return why or "a job before it was given up"
+        lost = next((each for each in log.jobs_before.get(late.job, ()) if each.state in ABANDONED), None)
+        if lost is not None:
+            return f"it waited for {lost.job}, which {'expired' if lost.state == 'expired' else 'was given up'}"
+        return why or "a job that it waited for was abandoned"
     begin_s = next((job.release_s for job in log.jobs if job.job == late.job), math.nan)
     if math.isnan(begin_s):
         return "its release is not recorded"
     end_s = own[0].start_s if own else late.due_s if late.state == "expired" else log.plan.horizon_s
     took_s = (own[0].finished_s or own[0].end_s) - end_s if own else 0.0
-    if begin_s + took_s > late.due_s:
+    able = log.able_arms(late.job) or []
+    work_s = _work_s(log, late.job, able)
+    if own:
+        known_s = 0.0 if own[0].finished_s else work_s.get(own[0].arm, 0.0)  # an unfinished job takes longer
+        work_s[own[0].arm] = max(took_s, known_s)
+    shortest_s = min(work_s.values(), default=0.0)
+    if begin_s + shortest_s > late.due_s:
         wait_s = late.due_s - begin_s
         due = f"{duration(abs(wait_s))} {'after' if wait_s >= 0 else 'before'} its release"
-        return f"its work takes {duration(took_s)}, and it was due {due}" if own else f"it was due {due}"
+        return f"its work takes {duration(shortest_s)}, and it was due {due}" if shortest_s else f"it was due {due}"
+    latest_s = late.due_s - shortest_s
     last, ready_s = log.last_before.get(late.job, (log.records[late.job], -math.inf))
+    others = [span for span in log.plan.assignments if span.arm in able and span.job != late.job]
     # One that never began waited for other reasons afterwards, if that was longer.
-    if (own and ready_s > late.due_s) or ready_s - begin_s > (end_s - begin_s) / 2:
+    if ready_s > latest_s and (own or ready_s - begin_s > (end_s - begin_s) / 2):
         if math.isfinite(ready_s):
-            return f"it waited for {last.job}, which finished at {clock(ready_s, log.begin)}"
+            then = _then(log, late, [span for span in others if ready_s <= span.start_s < end_s], work_s)
+            return f"it waited for {last.job}, which finished at {clock(ready_s, log.begin)}{then}"
         return f"it waits for {last.job}, which is not finished ({last.state.replace('_', ' ')})"
     begin_s = max(begin_s, ready_s)
-    able = log.able_arms(late.job)
     if not able:
         return "it was never awarded, and no offer for it or for a job with the same work is recorded"
+    if in_time := _begun_instead(log, late, work_s, begin_s, end_s):
+        return _passed(log, late, in_time, work_s, in_time=True)
     halts = {halt_text(log, halt): halt for halt in log.halts if halt.start_s < late.due_s}
     worthless = not own and end_s - late.due_s >= 60.0 * WORTHLESS_MIN and claims_no_late_jobs(log.policy)
     rule = f"; {log.policy} begins no job that would end {WORTHLESS_MIN:g} min late" if worthless else ""
+    decided = begin_s < latest_s < end_s and all(arm in work_s for arm in able)  # at its latest begin
+    begun_s, end_s = end_s, latest_s if decided else end_s
     waits_s = _arm_time(log, able, begin_s, end_s, halts, rule)
     if all(each.start_s >= late.due_s for each in log.plan.breaks):
         waits_s.pop(PAUSED)  # it was late before
@@ -208,9 +228,84 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
     if not arms:
         return f"what {names_text(able)} did meanwhile is not recorded"
     if not most:
-        return _passed(log, late, able, begin_s, end_s)
+        return _passed(log, late, [span for span in others if begin_s <= span.start_s < end_s], work_s)
     be = "" if most == PAUSED else "were " if len(arms) > 1 else "was "
-    return f"{names_text(arms)} {be}{most}"
+    why = f"{names_text(arms)} {be}{most}"
+    if decided and all(_occupied(log, arm, begin_s, late.due_s - work_s[arm]) for arm in able):
+        why += f"; no arm was free by {clock(latest_s, log.begin)}, its latest begin"
+        why += _then(log, late, [span for span in others if latest_s < span.start_s < begun_s], work_s)
+    return why
+
+
+def _then(log: ShiftLog, late: LateJob, ahead: Sequence[JobSpan], work_s: Mapping[str, float]) -> str:
+    """The jobs that went before a late one after its latest begin, after a semicolon; "" without such jobs."""
+    return f"; then {_passed(log, late, ahead, work_s)}" if ahead else ""
+
+
+def _work_s(log: ShiftLog, job: str, able: Sequence[str]) -> dict[str, float]:
+    """Time that a job takes each arm, s, by its offers, else by its offers for jobs with the same work."""
+    own, work, times_s = log.records.get(job), log.work(job), dict[str, float]()
+    offers = {(each.arm, each.job, each.time_s): each for each in log.offers if each.duration_s and each.arm in able}
+    for arm in able:
+        of_arm = [(each.job, each.duration_s or 0.0) for each in offers.values() if each.arm == arm]
+        like_s = [time_s for name, time_s in of_arm if name == job]
+        if not like_s and work is not None and own is not None:
+            alike = [(log.records[name], time_s) for name, time_s in of_arm if log.work(name) == work]
+            like_s = [time_s / record.cycles * own.cycles for record, time_s in alike if record.cycles]
+        if like_s:
+            times_s[arm] = median(like_s)
+    return times_s
+
+
+def _begun_instead(
+    log: ShiftLog, late: LateJob, work_s: Mapping[str, float], begin_s: float, end_s: float
+) -> list[JobSpan]:
+    """Other jobs that an arm began when the late one would still have been on time with it.
+
+    Those after which the arm had a break or failed before the late job would have been finished are left out, and those
+    at which the places of the late job were taken.
+
+    Args:
+        work_s: Time that the job takes each arm.
+        begin_s, end_s: The job waited for nothing but an arm from then on, and until then.
+    """
+    absences = (*log.plan.breaks, *log.plan.outages)
+
+    def possible(span: JobSpan) -> bool:
+        if span.job == late.job or span.arm not in work_s or not begin_s <= span.start_s < end_s:
+            return False
+        done_s = span.start_s + work_s[span.arm]
+        away = any(each.arm == span.arm and span.start_s < each.end_s and each.start_s < done_s for each in absences)
+        return done_s <= late.due_s and not away and not _place_taken(log, late.job, span)
+
+    return list(filter(possible, log.plan.assignments))
+
+
+def _place_taken(log: ShiftLog, job: str, span: JobSpan) -> bool:
+    """Whether jobs of other arms surely had each place at which a job can be done when an arm began another one."""
+
+    def ways(name: str) -> list[set[str]]:
+        return [{way} if isinstance(way, str) else set(way) for way in log.stream(name).get("places", ())]
+
+    others = [
+        ways(each.job)
+        for each in log.plan.assignments
+        if each.arm != span.arm and each.start_s < span.start_s < each.end_s
+    ]
+    own = ways(job)
+    taken = (any(other and all(way & theirs for theirs in other) for other in others) for way in own)
+    return bool(own) and all(taken)
+
+
+def _occupied(log: ShiftLog, arm: str, begin_s: float, end_s: float) -> bool:
+    """Whether an arm had a break, was out, or was at work on jobs from before, throughout."""
+    before = [each for each in log.plan.assignments if each.start_s < begin_s]
+    spans = [each for each in (*before, *log.plan.breaks, *log.plan.outages) if each.arm == arm]
+    at_s = begin_s
+    for span in sorted(spans, key=lambda each: each.start_s):
+        if span.start_s <= at_s:
+            at_s = max(at_s, span.end_s)
+    return at_s > end_s
 
 
 def _absence_in(span: JobSpan, event: Event) -> bool:
@@ -232,30 +327,38 @@ def _return_reason(log: ShiftLog, span: JobSpan) -> str:
     return f": {reason[0].lower()}{reason[1:]}" if reason else ""
 
 
-def _passed(log: ShiftLog, late: LateJob, able: Sequence[str], begin_s: float, end_s: float) -> str:
-    """How many jobs were awarded before a late one to arms that can do it, and what most of them have in common."""
-    ahead = [s for s in log.plan.assignments if s.arm in able and begin_s <= s.start_s < end_s and s.job != late.job]
+def _passed(
+    log: ShiftLog, late: LateJob, ahead: Sequence[JobSpan], work_s: Mapping[str, float], *, in_time: bool = False
+) -> str:
+    """How many jobs went before a late one on arms that can do it, and what most of them have in common.
+
+    Args:
+        ahead: These jobs, at least one.
+        work_s: Time that the late job takes each arm.
+        in_time: Whether the late job would have been on time instead of each of them; the last one is named then.
+    """
+    last = max(ahead, key=lambda span: span.start_s)
+    moment = clock(last.start_s, log.begin)
+    if in_time and len(ahead) == 1:
+        return f"at {moment}, still in time, {last.arm} was free and began {last.job} instead"
     records = log.records
-    took_s = {(o.arm, o.job, o.time_s): o.duration_s for o in log.offers if o.duration_s}
-    like = [s for (_, job, _), s in took_s.items() if job == late.job]
     own = records.get(late.job)
-    if own is not None and not like and (work := log.work(late.job)):  # by the time per cycle of the same work
-        alike = [(s, records[job]) for (_, job, _), s in took_s.items() if job in records and log.work(job) == work]
-        like = [s / record.cycles * own.cycles for s, record in alike if record.cycles]
-    own_s = median(like) if like else 0.0
+    took_s = {(o.arm, o.job, o.time_s): o.duration_s for o in log.offers if o.duration_s}
     counts = dict.fromkeys(("shorter", "worth more", "due earlier", "worth more per minute"), 0)
     for span in ahead:
-        span_s = took_s.get((span.arm, span.job, span.start_s), math.inf)
-        counts["shorter"] += span_s < own_s
+        span_s, own_s = took_s.get((span.arm, span.job, span.start_s), math.inf), work_s.get(span.arm, 0.0)
+        counts["shorter"] += span_s < own_s * (1 - SAME)
         if own is not None and (other := records.get(span.job)) is not None:
             counts["worth more"] += other.value > own.value
             counts["due earlier"] += other.due_s < own.due_s
-            counts["worth more per minute"] += other.value * own_s > own.value * span_s
+            counts["worth more per minute"] += other.value * own_s > own.value * span_s * (1 + SAME)
     most = max(counts, key=lambda trait: counts[trait])
     share = "all" if counts[most] == len(ahead) else str(counts[most])
-    which = f", {share} of them {most}" if 2 * counts[most] > len(ahead) else ""
+    which = f", which was {most}" if len(ahead) == 1 else f", {share} of them {most}"
+    which = which if 2 * counts[most] > len(ahead) else ""
     arms = [arm for arm in log.arms if any(span.arm == arm for span in ahead)]
-    return f"{len(ahead)} other job{'s' * (len(ahead) > 1)} went first on {names_text(arms)}{which}"
+    text = f"{len(ahead)} other job{'s' * (len(ahead) > 1)} went first on {names_text(arms)}{which}"
+    return f"{text}; at {moment}, still in time, {last.arm} began {last.job}" if in_time else text
 
 
 def _arm_time(

@@ -575,6 +575,23 @@ BAR_PX, TITLE_PX = 24, 44
 """Height of a bar, and of the title and the gap above the bars of a figure."""
 
 
+def _given_jobs(log: ShiftLog) -> Mapping[str, tuple[Any, ...]]:
+    """What each job of a shift was before any policy decided on it, by name."""
+    return {
+        job.job: (
+            job.release_s,
+            job.due_s,
+            job.value,
+            job.payload_kg,
+            job.cycles,
+            log.work(job.job),
+            log.stream(job.job).get("due"),
+            log.stream(job.job).get("after"),
+        )
+        for job in log.jobs
+    }
+
+
 def runs_page(
     logs: Mapping[str, ShiftLog],
     *,
@@ -595,7 +612,14 @@ def runs_page(
     table = runs_table(logs)
     settings = {row[0]: set(row[1 : len(logs) + 1]) for row in table.rows[:4]}
     differ = [name for name, values in settings.items() if len(values) > 1]
-    equal_jobs = not {"scenario", "seed"} & {*differ}
+    for name, key in (("content of the scenario", "scenario_hash"), ("code", "code_hash")):
+        hidden = "scenario" not in differ or key == "code_hash"  # of other scenarios other content is no news
+        if hidden and len({log.card.get(key) for log in logs.values()}) > 1:
+            differ.append(name)
+    first_jobs, *other_jobs = map(_given_jobs, logs.values())
+    equal_jobs = all(each == first_jobs for each in other_jobs)
+    if not equal_jobs:
+        differ.append("jobs")
     jobs = "All have the same jobs." if equal_jobs else "They have other jobs: their figures compare no policies."
     charts, replay = list[Chart](), None
     if equal_jobs and all(len(log.readings.time_s) for log in logs.values()):
@@ -619,7 +643,7 @@ def runs_page(
     figures = Section(key="figures", title="Figures", charts=tuple(charts), html=table.html(style="compared"))
     head = Head(
         badges=badges,
-        sentences=lead[:1] or (f"The runs differ in {', '.join(differ) or 'nothing'}. {jobs}",),
+        sentences=lead[:1] or (f"The runs differ in {names_text(differ) or 'nothing'}. {jobs}",),
         remarks=lead[1:],
         replay=replay,
         names=tuple(logs),

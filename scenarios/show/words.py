@@ -53,13 +53,20 @@ def value_text(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} {value_text(inner)}" for key, inner in value.items())
+        return ", ".join(
+            f"{key} {seed_text(inner) if key == 'seed' else value_text(inner)}" for key, inner in value.items()
+        )
     if isinstance(value, list | tuple):
         if not value:
             return "none"
         nested = any(isinstance(inner, Mapping | list | tuple) for inner in value)
         return f"list of {len(value)}" if nested else ", ".join(map(value_text, value))
     return str(value)
+
+
+def seed_text(seed: object) -> str:
+    """A seed; of a twin without the separator before an empty spawn key."""
+    return value_text(seed).removesuffix("/")
 
 
 def kind_text(kind: str) -> str:

@@ -137,8 +137,9 @@ def test_a_job_expires_at_a_hard_due_date_with_all_that_wait_for_it(small) -> No
     jobs = [
         small.job("soft", due_s=15.0),
         small.job("hard", due_s=15.0, expires=True),
-        small.job("next", after=("hard",)),
+        small.job("next", after=("begun", "hard")),
         small.job("begun", due_s=15.0, expires=True, repetitions=3),
+        small.job("last", after=("next",)),
     ]
     world, plant = small.shop([jobs], arms=1, slots=3)
     log, state = [], initial(world)
@@ -149,10 +150,12 @@ def test_a_job_expires_at_a_hard_due_date_with_all_that_wait_for_it(small) -> No
         state = step(world, state, np.array([[0]]), plant, log).state
     assert open_jobs(world, state)[0][0].tolist() == [0, -1, -1]
     state = step(world, state, np.array([[0]]), plant, log).state
-    assert state.status[0].tolist() == [WAITING, EXPIRED, GIVEN_UP, DONE]
+    assert state.status[0].tolist() == [WAITING, EXPIRED, GIVEN_UP, DONE, GIVEN_UP]
     assert [(e.time_s, e.job, e.arm) for e in log if e.kind == "expire"] == [(20.0, "hard", "")]
-    (lost,) = (e for e in log if e.kind == "give_up")
-    assert (lost.job, lost.arm, lost.time_s, lost.reason) == ("next", "", 20.0, "a job before it was given up")
+    assert [(e.job, e.arm, e.time_s, e.reason) for e in log if e.kind == "give_up"] == [
+        ("next", "", 20.0, "it waited for hard, which expired"),
+        ("last", "", 20.0, "it waited for next, which was given up"),
+    ]
 
 
 def test_a_job_behind_a_full_window_expires_too(small) -> None:

@@ -21,7 +21,7 @@ from fleet.robot import ThermalLimits
 from fleet.telemetry import Telemetry
 from scenarios.cli.look import last_folder
 from scenarios.live.recorder import Recorder
-from scenarios.live.trace import NOT_RECORDED, rows_of, thread_of, thread_table
+from scenarios.live.trace import NOT_RECORDED, Thread, rows_of, thread_of, thread_table
 from scenarios.prepare.fleet import Fleet, prepare
 from scenarios.result_folder import json_text
 from scenarios.run.log import FILES, code_hash, telemetry_table, versions_of
@@ -324,6 +324,31 @@ def test_the_command_shows_one_screen_or_json(folder: Path, thermofleet, capsys,
     assert code_hash() in screen
 
 
+def cells_of(thread: Thread) -> dict[str, str]:
+    """Texts of the table of a trace, by the names of their rows."""
+    return {row[0]: row[1] for row in thread_table(thread).rows}
+
+
+def test_a_trace_has_the_times_of_day_of_its_shift(folder: Path, tmp_path: Path) -> None:
+    begun = tmp_path / "begun"
+    shutil.copytree(folder, begun)
+    card = json.loads((begun / "run.json").read_text())
+    card["scenario"] |= {"shift_begin": "2026-11-23T10:00:00+01:00", "time_zone": "Europe/Berlin"}
+    (begun / "run.json").write_text(json.dumps(card))
+    cells, of_day = (cells_of(thread_of(each, "finish")) for each in (folder, begun))
+    for head in ("award", "job", "history"):
+        assert re.search(r"\b0:0\d:\d\d", cells[head])
+        assert of_day[head] == re.sub(r"\b0:(\d\d:\d\d)", r"10:\1", cells[head])
+    assert "finish at 10:0" in thread_table(thread_of(begun, "finish")).caption
+    assert "begin" not in thread_of(begun, "finish").as_json()
+
+
+def test_a_trace_gives_the_seed_of_a_twin_without_a_separator_at_its_end(folder: Path) -> None:
+    twin = {"version": "ab12", "data_hash": "cd34", "seed": "[0, 1]/"}
+    thread = replace(thread_of(folder, "finish"), twin={"arm": "arm", "version": "d:ab12", "twin": twin})
+    assert cells_of(thread)["trained on"] == "version ab12, data hash cd34, seed [0, 1]"
+
+
 def test_a_folder_without_a_run_is_said(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(FleetError, match=r"There is no run in 'runs'\. Give the folder"):
@@ -381,7 +406,7 @@ def test_a_recording_has_what_arms_published_and_says_what_is_missing(tmp_path: 
     ]
     assert (thread.job["award"], thread.job["difficulty"]) == ("award 1", 21.0)
     assert (thread.job["value"], thread.code["hash"]) == (2.0, NOT_RECORDED)
-    assert "state awarded, release 0:00:05, due 1:02:05, value 2" in dict(thread_table(thread).rows)["job"]
+    assert "state awarded, release 0:00:05, due 1:02:05, value 2" in cells_of(thread)["job"]
     assert json.loads(json_text(thread.as_json()))["event"]["kind"] == thread.event.kind
 
 
