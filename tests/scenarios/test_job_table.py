@@ -600,8 +600,18 @@ def test_errors_found_after_reading_name_file_row_and_column_all_at_once(tmp_pat
     assert [line.partition(" (")[0] for line in str(error.value).splitlines()] == [
         "cell.toml: 'jobs.csv', row 4, column places: no arm can do 'b' with 2 kg",
         "cell.toml: 'jobs.csv', row 5, column payload: no arm can do 'c' with 9 kg",
-        "cell.toml: 'jobs.csv', row 6, column places: no arm can do 'd' with 0 kg",
     ]
+    assert str(error.value).splitlines()[0].endswith(" The same holds for 'd' ('jobs.csv', row 6, column places).")
+    rows = [f"part_{number},hold,shelf,{number / 10}" for number in range(8)]
+    (tmp_path / "jobs.csv").write_text("\n".join(["name,kind,places,payload", *rows]), encoding="utf-8")
+    with pytest.raises(ScenarioError) as error:
+        prepare(with_table(tmp_path / "cell.toml", far, "jobs.csv"), difficulty="blind", cache=plans)
+    (line,) = str(error.value).splitlines()
+    assert line.startswith("cell.toml: 'jobs.csv', row 2, column places: no arm can do 'part_0' with 0 kg (")
+    assert line.endswith(
+        "The same holds for 7 other jobs, 'part_1' ('jobs.csv', row 3, column places) to 'part_7' ('jobs.csv', row 9, "
+        "column places)."
+    )
 
 
 def test_the_name_of_a_table_and_blank_rows_change_no_hash(tmp_path):
