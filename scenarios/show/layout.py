@@ -44,8 +44,9 @@ class Reach:
     place: str
     payload_kg: float | None
     """Heaviest payload of the scenario's jobs at this place that the arm can carry; None if it can do none."""
-    lacks_m: float
-    """How much longer the arm would have to be to touch the place; 0 within reach."""
+    lacks_m: float | None
+    """Distance of the place beyond the outstretched arm; 0 within it. None if the arm can do no job there though the
+    place is within it, for example because its wrist would be too far away; see `reason`."""
     reason: str = ""
     """Why it cannot do some of them."""
 
@@ -130,7 +131,7 @@ def layout_parts(scenario: Scenario, report: LayoutReport) -> list[Table | str]:
         numbers=False,
         notes=notes,
     )
-    near = sorted(report.reach, key=lambda entry: entry.lacks_m)
+    near = sorted(report.reach, key=lambda entry: entry.lacks_m or 0.0)
     cannot, notes = _first([(f"{entry.arm} at {entry.place}", entry.reason) for entry in near if entry.reason])
     reasons = Table(head=("cannot do", "reason"), rows=cannot, numbers=False, notes=notes)
     shared = [pair for pair in report.exclusions if not pair.same_place]
@@ -173,11 +174,12 @@ def _reach(place: Place, arms: Sequence[PlannedArm], works: Sequence[Work]) -> I
         able_kg = [work.payload_kg for work in works_there if work in arm.plans]
         reasons = dict.fromkeys(error.reason for error in arm.infeasible if error.place == place.name)
         far_m = float(np.linalg.norm(np.subtract(place.position_m, shoulder_m(robot))))
+        beyond_m = max(0.0, far_m - REACH_M)
         yield Reach(
             arm=robot.name,
             place=place.name,
             payload_kg=max(able_kg, default=None),
-            lacks_m=max(0.0, far_m - REACH_M),
+            lacks_m=None if reasons and not able_kg and not beyond_m else beyond_m,
             reason="; ".join(reasons),
         )
 
