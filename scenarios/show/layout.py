@@ -244,10 +244,13 @@ def _most_at_once(scenario: Scenario, plans: Sequence[Plan], space: SpaceTable) 
 SEEDS = 5
 """Shifts over which the load factor is averaged."""
 REGIMES = {
-    "hopeless": "The shift is hopeless: more than the fleet can do without overheating or being late",
-    "heat decides": "Heat decides: who does what decides whether motors overheat",
-    "time decides": "Time decides: every choice of arm heats the motors alike, or too little to matter",
-    "nothing decides": "Nothing decides: the arms have time, and every choice heats the motors alike or too little",
+    "hopeless": "The shift is hopeless: by its averages, the fleet cannot do all jobs in time below the warning limit",
+    "heat decides": "Heat decides: by averages over the shift, motors are clearly cooler with the best assignment than "
+    "with an equal split",
+    "time decides": "Time decides: by averages over the shift, the arms are busy, and an equal split heats motors "
+    "little, or like the best assignment",
+    "nothing decides": "Nothing decides: by averages over the shift, the arms have time, and an equal split heats "
+    "motors little, or like the best assignment",
 }
 """Sentences of the regimes of `LoadFactor`."""
 MOST_TIMES = 4
