@@ -181,8 +181,8 @@ class Local(ArrayPolicy):
         self._policy.reset(rng)
 
     def choose(self, observation: Observation, arm_index: int) -> int:
-        """The action of the central policy for a fleet of this arm."""
-        return self._policy.act({"": observation})[""]
+        """The action of the central policy for a fleet of this arm; it waits without one."""
+        return self._policy.act({"": observation}).get("", WAIT)
 
     def actions(self, seen: Observation) -> Array:
         """Those of every arm for itself, if the central policy is an `ArrayPolicy` without a state."""

@@ -19,12 +19,12 @@ from fleet.errors import visible
 
 if TYPE_CHECKING:
     from jinja2 import Environment
-    from rich.console import Group
+    from rich.console import Console, ConsoleOptions, Group, RenderResult
 
 
-MOST_LABEL, LONGEST_WORD, LEAST_TEXT = 40, 12, 24
-"""Characters on the terminal: of a row's label, so that a long name leaves room for the figures; of a word of another
-column, up to which it is not broken; and of a text that is shortened to fit into a line."""
+MOST_LABEL, LONGEST_NAME, LONGEST_WORD, LEAST_TEXT = 40, 24, 12, 24
+"""Characters on the terminal: of a row's label, so that a long name leaves room for the figures; of a label, and of a
+word of another column, up to which they are not broken; and of a text that is shortened to fit into a line."""
 
 
 TABLE_FILES = (".csv", ".xlsx")
@@ -127,6 +127,25 @@ class Table:
         columns = zip(self.headings, *self.rows, strict=True)
         return [max(cell_len(visible(cell)) for cell in column) for column in columns]
 
+    def _fitted(self, room: int) -> list[int]:
+        """Of each column on the terminal, characters; wide ones are narrowed first, down to names or words."""
+        from rich.cells import cell_len
+
+        labels = [f"{'  ' * bool(self.groups)}{row[0]}" for row in self.rows]
+        first, *others = zip(self.headings, *self.rows, strict=True)
+        columns = [(first[0], *labels, *self.groups.values()), *others]
+        lines = [[line for cell in column for line in visible(cell, "\n").split("\n")] for column in columns]
+        widths = [max(map(cell_len, column)) for column in lines]
+        words = [max(map(cell_len, " ".join(column).split()), default=0) for column in lines]
+        least = [min(longest, LONGEST_WORD) for longest in words]
+        if self.numbers:
+            widths[0] = min(widths[0], MOST_LABEL)
+            names = max((cell_len(visible(label)) for label in labels), default=0)
+            least[0] = max(least[0], min(names, LONGEST_NAME, room - sum(least[1:])))
+        while sum(widths) > room and (wide := [i for i, own in enumerate(widths) if own > least[i]]):
+            widths[max(wide, key=lambda i: widths[i])] -= 1
+        return widths
+
     def in_lines(self, width: int, leave_out: Sequence[str]) -> "Table":
         """The table with one line for each row on a terminal.
 
@@ -153,8 +172,8 @@ class Table:
             part = replace(self, rows=self.rows[begin:end], groups={}, caption="", notes=())
             yield self.groups[begin], part
 
-    def rich(self) -> "Group":
-        """For a console of rich, without lines."""
+    def rich(self, width: int) -> "Group":
+        """For a console of rich of this width, without lines."""
         from rich.console import Group
         from rich.table import Table as RichTable
         from rich.text import Text
@@ -163,12 +182,10 @@ class Table:
             return Text(visible(cell, "\n"), style=style)  # before rich measures its width
 
         table = RichTable(box=None, pad_edge=False, show_header=any(self.headings))
+        widths = self._fitted(width - 2 * (len(self.head) - 1))
         for number, (heading, words) in enumerate(zip(self.headings, self.words, strict=True)):
-            widest = MOST_LABEL if self.numbers and not number else None
             style = "bold" if not number and not table.show_header else None
-            words_of = " ".join([heading, *(row[number] for row in self.rows)]).split() if number else []
-            least = min(LONGEST_WORD, max(map(len, words_of), default=0))
-            how = {"overflow": "fold", "max_width": widest, "min_width": least or None, "style": style}
+            how = {"overflow": "fold", "width": widths[number], "style": style}
             table.add_column(text(heading), justify="left" if words else "right", **how)
         for index, row in enumerate(self.rows):
             if index in self.groups:
@@ -183,11 +200,11 @@ class Table:
         from rich.console import Console
 
         text = io.StringIO()
-        Console(file=text, width=120).print(self.rich())
+        Console(file=text, width=120).print(self)
         return text.getvalue().rstrip("\n")
 
-    def __rich__(self) -> "Group":
-        return self.rich()
+    def __rich_console__(self, _: "Console", options: "ConsoleOptions") -> "RenderResult":
+        yield self.rich(options.max_width)
 
     def html(
         self, *, style: str = "", kinds: Sequence[str] = (), moments: Sequence[Moment] = (), key: str = ""

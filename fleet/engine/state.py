@@ -223,7 +223,7 @@ class State(NamedTuple):
     repetitions = Column("jobs", "repetitions")
     """int [env, job]."""
     expires = Column("jobs", "expires")
-    """Whether the job expires at its due date if no arm has begun it, bool [env, job]."""
+    """Whether the job expires if it waits after its due date, begun before or not, bool [env, job]."""
     status = Column("jobs", "status")
     """WAITING, RUNNING, DONE, GIVEN_UP or EXPIRED, int [env, job]."""
     queued_s = Column("jobs", "queued_s")

@@ -186,6 +186,8 @@ def problems_of(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) ->
     problems += [f"{file}: {sentence}." for sentence in _outside_limits_at_home(scenario, arms, folder)]
     infeasible = [error for arm in arms for error in arm.infeasible]
     possible = {work for arm in arms for work in arm.plans}
+    # By column and reasons: the sentence on the first job, and the others.
+    impossible = dict[tuple[str, tuple[str, ...]], tuple[str, list[str]]]()
     for i, stream in enumerate(scenario.jobs if arms else ()):
         loads = [f"{kg:g}" for kg in stream.payload_kg if possible.isdisjoint(alternatives_of(scenario, stream, kg))]
         if not loads:
@@ -197,11 +199,22 @@ def problems_of(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) ->
             continue  # it may be possible once the homes are apart
         more = f"; and {len(reasons) - REASONS} more" if len(reasons) > REASONS else ""
         column = "payload" if stream.row and here and all(error.too_heavy for error in here) else "places"
-        problems.append(
+        sentence = (
             f"{file}: {stream.place_of(i, column)}: no arm can do '{stream.name}' with {' or '.join(loads)} kg "
             f"({'; '.join(reasons[:REASONS])}{more}); move the places or an arm, or make the load lighter."
         )
-    return problems
+        if (alike := (column, tuple(reasons))) in impossible:
+            impossible[alike][1].append(f"'{stream.name}' ({stream.place_of(i, column)})")
+        else:
+            impossible[alike] = sentence, []
+    return problems + [_with_others(sentence, others) for sentence, others in impossible.values()]
+
+
+def _with_others(sentence: str, others: Sequence[str]) -> str:
+    """A sentence on a job, and how many other jobs have the same reasons."""
+    if len(others) < 2:
+        return f"{sentence} The same holds for {others[0]}." if others else sentence
+    return f"{sentence} The same holds for {len(others)} other jobs, {others[0]} to {others[-1]}."
 
 
 def _outside_limits_at_home(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) -> list[str]:

@@ -10,9 +10,9 @@ over the shift of length T; 1 is the capacity of the fleet:
   (Σ_j t_aj x_aj ≤ T, or the time load's λ·T if larger): the load of the best assignment;
 - blind: the load of the hottest arm when every job is split equally among the arms that can do it.
 
-Above 1.2 for the best assignment no policy keeps the fleet below the limit. Below 0.6 for the blind one every policy
-does. In between heat decides if the two differ. Otherwise every choice of arm heats alike, and time decides if the arms
-are busy.
+Above 1.2 for the best assignment, or in time, the shift is hopeless. From a blind load of 0.6 on, heat decides if the
+best assignment has less than 0.9 of it. Otherwise time decides from a time load of 0.6 on. All loads are averages over
+the shift: motors may pass the limit for a while at a low load, or nowhere where heat decides.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ Array = np.ndarray
 
 
 LITTLE, ALIKE = 0.6, 0.9
-"""Below this load no choice matters; the best assignment heats like an equal split if it has this share of its load."""
+"""Load from which heat or time may decide; share of the equal split's load from which the best one heats alike."""
 
 
 @dataclass(frozen=True)

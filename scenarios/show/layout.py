@@ -44,8 +44,9 @@ class Reach:
     place: str
     payload_kg: float | None
     """Heaviest payload of the scenario's jobs at this place that the arm can carry; None if it can do none."""
-    lacks_m: float
-    """How much longer the arm would have to be to touch the place; 0 within reach."""
+    lacks_m: float | None
+    """Distance of the place beyond the outstretched arm; 0 within it. None if the arm can do no job there though the
+    place is within it, for example because its wrist would be too far away; see `reason`."""
     reason: str = ""
     """Why it cannot do some of them."""
 
@@ -130,7 +131,7 @@ def layout_parts(scenario: Scenario, report: LayoutReport) -> list[Table | str]:
         numbers=False,
         notes=notes,
     )
-    near = sorted(report.reach, key=lambda entry: entry.lacks_m)
+    near = sorted(report.reach, key=lambda entry: entry.lacks_m or 0.0)
     cannot, notes = _first([(f"{entry.arm} at {entry.place}", entry.reason) for entry in near if entry.reason])
     reasons = Table(head=("cannot do", "reason"), rows=cannot, numbers=False, notes=notes)
     shared = [pair for pair in report.exclusions if not pair.same_place]
@@ -173,11 +174,12 @@ def _reach(place: Place, arms: Sequence[PlannedArm], works: Sequence[Work]) -> I
         able_kg = [work.payload_kg for work in works_there if work in arm.plans]
         reasons = dict.fromkeys(error.reason for error in arm.infeasible if error.place == place.name)
         far_m = float(np.linalg.norm(np.subtract(place.position_m, shoulder_m(robot))))
+        beyond_m = max(0.0, far_m - REACH_M)
         yield Reach(
             arm=robot.name,
             place=place.name,
             payload_kg=max(able_kg, default=None),
-            lacks_m=max(0.0, far_m - REACH_M),
+            lacks_m=None if reasons and not able_kg and not beyond_m else beyond_m,
             reason="; ".join(reasons),
         )
 
@@ -242,10 +244,13 @@ def _most_at_once(scenario: Scenario, plans: Sequence[Plan], space: SpaceTable) 
 SEEDS = 5
 """Shifts over which the load factor is averaged."""
 REGIMES = {
-    "hopeless": "The shift is hopeless: more than the fleet can do without overheating or being late",
-    "heat decides": "Heat decides: who does what decides whether motors overheat",
-    "time decides": "Time decides: every choice of arm heats the motors alike, or too little to matter",
-    "nothing decides": "Nothing decides: the arms have time, and every choice heats the motors alike or too little",
+    "hopeless": "The shift is hopeless: by its averages, the fleet cannot do all jobs in time below the warning limit",
+    "heat decides": "Heat decides: by averages over the shift, motors are clearly cooler with the best assignment than "
+    "with an equal split",
+    "time decides": "Time decides: by averages over the shift, the arms are busy, and an equal split heats motors "
+    "little, or like the best assignment",
+    "nothing decides": "Nothing decides: by averages over the shift, the arms have time, and an equal split heats "
+    "motors little, or like the best assignment",
 }
 """Sentences of the regimes of `LoadFactor`."""
 MOST_TIMES = 4

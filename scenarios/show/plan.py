@@ -117,7 +117,7 @@ def _place_remark(place: str, report: LayoutReport) -> str:
     entries = _of_place(place, report)
     if any(each.payload_kg is not None for each in entries):
         return ""
-    lacks_m = min((each.lacks_m for each in entries), default=0.0)
+    lacks_m = min((each.lacks_m or 0.0 for each in entries), default=0.0)
     return f"lacks {lacks_m:.2f} m" if lacks_m else "no arm can work here"
 
 

@@ -24,8 +24,9 @@ from scenarios.spec.schema import MOST_BREAKS, Scenario
 
 _LOG = logging.getLogger(__name__)
 WEEKDAYS = ("monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday")
-DAY, LONGEST_NIGHT = timedelta(days=1), timedelta(hours=12)
-"""The end of a day, and the longest break beyond it: a longer one has its begin and end exchanged."""
+HOUR = timedelta(hours=1)
+DAY, LONGEST_NIGHT = 24 * HOUR, 12 * HOUR
+"""The end of a day, and the longest break beyond it: a longer one probably has its begin and end exchanged."""
 SHORT_S = 60.0
 """Length below which the times of a break are probably minutes."""
 FAILURES = 3
@@ -124,8 +125,17 @@ def _break_times(
     first, last = (_clock(given[name], f"{where}.{name}") for name in ("begin", "end"))
     if next_day := last <= first:
         last += DAY
-    if next_day and (not timedelta() < last - first < DAY or (last - first > LONGEST_NIGHT and last != DAY)):
-        raise ScenarioError(f"{where}: it ends at {given['end']}, before it begins at {given['begin']}.")
+    if next_day and last - first in (timedelta(), DAY):
+        raise ScenarioError(
+            f"{where}: {given['begin']} to {given['end']} begins and ends at the same time of day; a whole day is 0:00 "
+            "to 24:00."
+        )
+    if next_day and last - first > LONGEST_NIGHT and last != DAY:
+        advice = "as two, to 24:00 and from 0:00 on the next days" if "weekdays" in given else "with dates"
+        raise ScenarioError(
+            f"{where}: {given['begin']} to {given['end']} lasts {(last - first) / HOUR:.4g} h over midnight, but at "
+            f"most {LONGEST_NIGHT / HOUR:g} h are taken: are begin and end exchanged? Give a longer break {advice}."
+        )
     found, touched = list[dict[str, Any]](), False
     for day_s, date in _days(given.get("weekdays", list(WEEKDAYS)), begin, horizon_s, where):
         begin_s, end_s = day_s(date, first), day_s(date, last)

@@ -52,7 +52,7 @@ _ARROW, _SEPARATOR = re.compile(r"->|→|>"), re.compile("[;,]")
 """Between from and to; and what may be in a name, but is often written instead of `|`."""
 _DOTTED_CLOCK = re.compile(r"([01]?\d|2[0-3])[.,]([0-5]\d)")
 """A time of day as it is written in German; seconds have one decimal or none, as a decision takes them."""
-_HOURS = re.compile(r"([1-9]|1\d|2[0-3])(?:[.,](\d))?")
+_HOURS = re.compile(r"(\d|1\d|2[0-3])(?:[.,](\d+))?")
 """A number that is a time of day, in hours or in German, if the other times of a table have minutes."""
 _MILITARY_CLOCK = re.compile(r"(0\d)([0-5]\d)")
 _THOUSANDS = re.compile(r"[1-9]\d{0,2}(\.\d{3})+")
@@ -88,6 +88,10 @@ class _Dialect(NamedTuple):
     """Whether a number below 1 may be a time of day, as in a sheet."""
     names: Collection[str] = ()
     """Of all jobs of the table."""
+    plain: Collection[str] = ()
+    """Columns of the table whose headings name no unit."""
+    column: str = ""
+    """Of the cell; "" outside of a table."""
     factor: float = 1.0
     """Of a plain number, to s or kg."""
     tell: Callable[[str], None] = _LOG.warning
@@ -127,9 +131,9 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
         hours, minutes, seconds = (float((part or "0").replace(",", ".")) for part in clock.groups())
         given_s = 3600 * hours + 60 * minutes + seconds
         return given_s if begin is None else _clock_seconds(text, given_s, begin, dialect)
-    if isinstance(cell, str) and (dotted := _DOTTED_CLOCK.fullmatch(text)):
-        number = _three_decimals(text, dialect)
-        raise ValueError(f"is this {dotted[1]}:{dotted[2]}? Give times as h:mm, or a number as {number}")
+    asks = not dialect.column or dialect.column in dialect.plain
+    if isinstance(cell, str) and asks and (dotted := _DOTTED_CLOCK.fullmatch(text)):
+        raise ValueError(f"is this {dotted[1]}:{dotted[2]}? {_advice(dialect.column)} (got {_shown(cell)})")
     if isinstance(cell, str) and (clock := _MILITARY_CLOCK.fullmatch(text)):
         raise ValueError(f"is this {clock[1]}:{clock[2]}? Give times as h:mm, or a number as {int(text)}")
     try:
@@ -144,10 +148,9 @@ def _seconds(cell: Cell, dialect: _Dialect) -> float:
     return number
 
 
-def _three_decimals(text: str, dialect: _Dialect) -> str:
-    """A number in a form that is no time of day, with the decimal sign of the table."""
-    number = f"{float(text.replace(',', '.')):.3f}"
-    return number.replace(".", ",") if dialect.decimal_comma else number
+def _advice(column: str) -> str:
+    """How to give times so that no number may be hours; `column` is "" outside of a table."""
+    return f"Give times as h:mm{f', or seconds in a column {column}_s' if column else ''}"
 
 
 def _clock_seconds(text: str, given_s: float, begin: datetime, dialect: _Dialect) -> float:
@@ -158,10 +161,18 @@ def _clock_seconds(text: str, given_s: float, begin: datetime, dialect: _Dialect
     today, tomorrow = (midnight + timedelta(days=days, seconds=given_s) for days in (0, 1))
     moment = today if max(since(begin, today.replace(fold=fold)) for fold in (0, 1)) >= 0 else tomorrow
     if moment == tomorrow and since(begin, tomorrow) > dialect.horizon_s:
+        end = (begin.astimezone(UTC) + timedelta(seconds=dialect.horizon_s)).astimezone(begin.tzinfo)
+        next_day = " of the next day" if end.date() > begin.date() else ""
         raise ValueError(
-            f"'{text}' is outside the shift, which begins at {begin:%H:%M} and ends before {text} of the next day"
+            f"'{text}' is outside the shift, which begins at {_clock_text(begin)} and ends at "
+            f"{_clock_text(end)}{next_day}"
         )
     return _local_seconds(moment, f"'{text}'", begin, dialect.tell)
+
+
+def _clock_text(moment: datetime) -> str:
+    """Time of day, with its seconds if there are any."""
+    return f"{moment:%H:%M:%S}".removesuffix(":00")
 
 
 def _date_seconds(text: str, cell: Cell, begin: datetime | None, tell: Callable[[str], None]) -> float:
@@ -396,7 +407,8 @@ def read_job_table(
     body = list(islice(lines, MOST_ROWS + 1))
     if len(body) > MOST_ROWS:
         raise ScenarioError(f"{where} has too many rows; a job table has at most {MOST_ROWS}.")
-    dialect = _Dialect(begin, decimal_comma, horizon_s, is_sheet, names=_names_of(body, columns))
+    plain = {column for i, (column, _) in columns.items() if _key_of(head[i]) == column}
+    dialect = _Dialect(begin, decimal_comma, horizon_s, is_sheet, names=_names_of(body, columns), plain=plain)
     no_place = _no_place(places or ())
     rows: dict[str, tuple[int, Row]] = {}
     for number, cells in body:
@@ -416,8 +428,7 @@ def read_job_table(
             fields = {**vars(row), "places": row.every_places[0], "alternatives": row.every_places[1:]}
             jobs[number] = JobSpec(**{name: fields[name] for name in fields if name not in ("every_places", "texts")})
         rows.setdefault(row.name, (number, row))
-    plain = {column for i, (column, _) in columns.items() if _key_of(head[i]) == column}
-    _check_hours(rows.values(), plain, errors, doubts)
+    _check_hours(rows.values(), dialect.plain, errors, doubts)
     heaviest_kg = max((row.payload_kg for _, row in rows.values()), default=0.0)
     if ("payload", GRAMS) in columns.values() and 0.0 < heaviest_kg < LIGHT_KG:
         errors.add(
@@ -510,7 +521,7 @@ def _read_row(
         try:
             if not _is_empty(cell):
                 tell = partial(doubts.add, number, column)
-                setattr(row, field, convert(cell, dialect._replace(factor=factor, tell=tell)))
+                setattr(row, field, convert(cell, dialect._replace(column=column, factor=factor, tell=tell)))
                 if convert is _job_time:
                     row.texts[field] = _time_text(cell)
             elif column in _NEEDED:
@@ -584,7 +595,7 @@ def _check_hours(rows: Collection[tuple[int, Row]], columns: Collection[str], er
 
     Args:
         columns: Those whose headings name no unit.
-        errors, doubts: Get numbers with and without a decimal.
+        errors, doubts: Get numbers with and without decimals.
     """
     if not any(":" in text for _, row in rows for text in row.texts.values()):
         return
@@ -593,13 +604,20 @@ def _check_hours(rows: Collection[tuple[int, Row]], columns: Collection[str], er
             column, hours = _COLUMN_OF[field], _HOURS.fullmatch(text)
             if hours is None or column not in columns:
                 continue
-            hour, tenth = hours[1], int(hours[2] or 0)
-            meant = f"{hour}:{6 * tenth:02d} or {hour}:{tenth}0" if tenth else f"{hour}:00"
-            advice = f"Give times as h:mm, or seconds in a column {column}_s"
             if hours[2]:
-                errors.add(number, column, f"is this {meant}? {advice} (got {_shown(text)})")
-            else:
-                doubts.add(number, column, f"{_shown(text)} counts as {text} s; is this {meant}? {advice}")
+                errors.add(
+                    number, column, f"is this {_meant(hours[1], hours[2])}? {_advice(column)} (got {_shown(text)})"
+                )
+            elif hours[1] != "0":
+                doubts.add(number, column, f"{_shown(text)} counts as {text} s; is this {text}:00? {_advice(column)}")
+
+
+def _meant(hour: str, decimals: str) -> str:
+    """Times of day that a number may mean: with a part of an hour, and with minutes after the point."""
+    minute_of_day = round(60 * float(f"{hour}.{decimals}"))
+    as_hours = f"{minute_of_day // 60}:{minute_of_day % 60:02d}"
+    minutes = f"{decimals:0<2}"[:2]
+    return " or ".join(dict.fromkeys([as_hours, *([f"{hour}:{minutes}"] if int(minutes) < 60 else [])]))
 
 
 def _check_after(rows: Mapping[str, tuple[int, Row]], errors: _Errors, *, closed: bool) -> None:

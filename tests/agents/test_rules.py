@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from agents.policy import WAIT, EveryArm, for_all_arms, on_arrays, only_choices
+from agents.policy import WAIT, EveryArm, Local, for_all_arms, on_arrays, only_choices
 from agents.registry import RULES, make_policy
 from agents.rules import RandomLegal, Wspt, WsptCool
 from fleet.env.allocation_v2 import parallel_env
@@ -361,3 +361,12 @@ def test_the_arm_with_less_work_gets_the_next_job_and_a_lost_claim_is_no_work() 
     assert policy.act({"a": short, "b": nothing}) == {"a": 1, "b": 0}
     many = [policy.act({"a": short, "b": short}) for _ in range(9)]
     assert [claims["b"] for claims in many] == [1] * 8 + [0]  # from 200 s to 1000 s, which is equal: the first arm
+
+
+def test_an_arm_that_the_central_policy_of_a_local_one_omits_waits() -> None:
+    class Omits:
+        def act(self, observations) -> dict[str, int]:
+            return {}
+
+    local = type("OmitsLocal", (Local,), {"central": Omits})()
+    assert local.choose(queue([100.0], [9e3], [1]), 0) == WAIT

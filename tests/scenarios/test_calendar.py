@@ -88,6 +88,18 @@ def test_a_recurring_time_of_day_that_occurs_never_or_twice_is_told(date, senten
     assert f"jobs[0].arrivals: {date} {sentence}" in caplog.text
 
 
+def test_breaks_of_more_than_12_h_are_given_as_the_error_advises() -> None:
+    def spans(begin: str, *breaks: dict) -> list[tuple[float, float]]:
+        raw = small() | {"horizon_s": 40 * HOUR_S, "shift_begin": begin, "breaks": list(breaks)}
+        return [(each.begin_s / HOUR_S, each.end_s / HOUR_S) for each in parse_scenario(raw, FILE).breaks]
+
+    dates = {"name": "long", "begin": "2026-11-23T14:00", "end": "2026-11-24T06:00"}
+    assert spans("2026-11-23T05:00Z", dates) == [(9.0, 25.0)]
+    evening = {"name": "long", "begin": "14:00", "end": "24:00", "weekdays": ["monday"]}
+    night = {"name": "long", "begin": "0:00", "end": "6:00", "weekdays": ["tuesday"]}
+    assert spans("2026-11-23T05:00Z", evening, night) == [(9.0, 19.0), (19.0, 25.0)]
+
+
 def test_a_daily_night_break_covers_the_begin_of_the_shift() -> None:
     days = ["monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday"]
     entry = {"name": "night", "begin": "22:00", "end": "6:00", "weekdays": days}
@@ -175,11 +187,21 @@ BREAK = {"name": "lunch", "begin": "4:00", "end": "5:00"}
         ({"breaks": [BREAK | {"begin": "11.30"}]}, r"breaks\[0\]: is this 11:30\? Give times as h:mm"),
         (
             {"breaks": [BREAK | {"begin": "11:30", "end": "11:00"}], "shift_begin": "2026-11-23T06:00Z"},
-            r"breaks\[0\]: it ends at 11:00, before it begins at 11:30",
+            r"breaks\[0\]: 11:30 to 11:00 lasts 23.5 h over midnight, but at most 12 h are taken: are begin and end "
+            r"exchanged\? Give a longer break with dates\.",
+        ),
+        (
+            {"breaks": [BREAK | {"begin": "14:00", "end": "6:00", "weekdays": ["monday"]}],
+             "shift_begin": "2026-11-23T06:00Z"},
+            r"14:00 to 6:00 lasts 16 h .* Give a longer break as two, to 24:00 and from 0:00 on the next days\.",
+        ),
+        (
+            {"breaks": [BREAK | {"begin": "9:00", "end": "9:00"}], "shift_begin": "2026-11-23T06:00Z"},
+            r"breaks\[0\]: 9:00 to 9:00 begins and ends at the same time of day; a whole day is 0:00 to 24:00\.",
         ),
         (
             {"breaks": [BREAK | {"begin": "24:00", "end": "0:00"}], "shift_begin": "2026-11-23T06:00Z"},
-            r"breaks\[0\]: it ends at 0:00, before it begins at 24:00",
+            r"breaks\[0\]: 24:00 to 0:00 begins and ends at the same time of day",
         ),
         ({"breaks": [BREAK | {"begin_s": 14400}]}, r"breaks\[0\]: begin and begin_s are the same time; keep one"),
         ({"breaks": [BREAK | {"arms": []}]}, r"breaks\[0\].arms is empty: name the arms, or leave it out"),

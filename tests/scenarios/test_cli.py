@@ -169,7 +169,7 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(thermofleet, small_tom
     assert said.code == 2
     assert said.err.startswith("Error: ")
     assert sentence in said.err
-    assert said.err.count("\n") == (2 if edit is unreachable else 1)  # two jobs need the place
+    assert said.err.count("\n") == 1
     assert said.err.endswith(".\n")
     assert "Traceback" not in said.err
     assert said.out == ""

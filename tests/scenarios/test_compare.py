@@ -26,7 +26,7 @@ from scenarios.cli import options
 from scenarios.evaluate import runner
 from scenarios.evaluate.comparison import Comparison, Failed, compare, comparisons, figures_table, scores_over_all
 from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
-from scenarios.evaluate.scores import Shift
+from scenarios.evaluate.scores import HEADS, Shift
 from scenarios.evaluate.sources import _Random
 from scenarios.evaluate.statistics import Figure, interval
 from scenarios.evaluate.store import read_rows
@@ -52,6 +52,21 @@ def printed(result: Comparison) -> str:
     page = io.StringIO()
     Console(file=page, width=80).print(result.table)
     return page.getvalue()
+
+
+def test_names_are_whole_and_no_figure_is_cut_in_80_columns() -> None:
+    figure, names = "0.41 [0.35, 0.47]", ("train-pairs-*@oracle", "quickstart/0", "auction" * 9)
+    table = Table(head=HEADS, rows=tuple((name, figure, f"-{figure}", "**", *[figure] * 4) for name in names))
+    page = io.StringIO()
+    Console(file=page, width=80).print(table)
+    told = page.getvalue()
+    assert max(map(len, told.splitlines())) <= 80
+    assert all(name in told.split() for name in names[:2])
+    assert [told.split().count(part) for part in ("[0.35,", "0.47]")] == [6 * len(names)] * 2
+    spans = [(name, "217.3", "214.1 … 220.5", "-16.4", "-19.9 … -12.8", "**") for name in names[:2]]
+    table = Table.grouped(("", "mean", "interval", "difference", "interval", ""), {"reward": spans})
+    Console(file=page, width=66).print(table)
+    assert "  train-pairs-*@oracle" in page.getvalue()
 
 
 def test_a_scenario_is_a_file_too_and_the_first_policy_the_default_baseline(small_toml, scenario, plans):

@@ -294,7 +294,10 @@ def test_what_a_german_spreadsheet_writes_is_read_or_asked_about(tmp_path):
         ("a;hold;bench;;;;46349,27;;;", "column due: is this 23 Nov 2026 06:28, in days as a spreadsheet counts? Give"),
         ("a;hold;bench;;;;46349,9930555;;;", "column due: is this 23 Nov 2026 23:50, in days"),
         ("a;hold;bench;;;;2026-11-24;;;", "column due: a date needs a time, as 2026-11-24T14:00 (got '2026-11-24')"),
-        ("a;hold;bench;;;6:01;5:00;;;", "column due: '5:00' is outside the shift, which begins at 06:00 and"),
+        (
+            "a;hold;bench;;;6:01;5:00;;;",
+            "column due: '5:00' is outside the shift, which begins at 06:00 and ends at 06:03.",
+        ),
     ):
         assert sentence in errors_of(tmp_path, f"{SHORT.replace(',', ';')}\n{row}\n", begin)
 
@@ -341,10 +344,21 @@ def test_hours_among_clock_times_are_asked_about(tmp_path, caplog):
         ("release", "23,5", "column release: is this 23:30 or 23:50? Give times as h:mm, or seconds in a column "),
         ("release", "23.5", "column release: is this 23:30 or 23:50? Give times as h:mm, or seconds in a column "),
         ("release", "23,0", "column release: is this 23:00? Give times as h:mm, or seconds in a column release_s (got"),
-        ("release", "23,30", "column release: is this 23:30? Give times as h:mm, or a number as 23,300."),
+        (
+            "release",
+            "23,30",
+            "column release: is this 23:30? Give times as h:mm, or seconds in a column release_s (got",
+        ),
+        (
+            "release",
+            "9,75",
+            "column release: is this 9:45? Give times as h:mm, or seconds in a column release_s (got '9",
+        ),
+        ("release", "10,150", "column release: is this 10:09 or 10:15? Give times as h:mm, or seconds in a column rel"),
+        ("release", "0.999", "column release: is this 1:00? Give times as h:mm, or seconds in a column release_s (got"),
         ("release", "23", ""),
         ("release_s", "23,5", ""),
-        ("release", "23,300", ""),
+        ("release_s", "23,30", ""),
         ("release", "24,5", ""),
     ):
         text = f"name;kind;places;{heading};due\na;hold;bench;{time_};\nb;hold;bench;;22:02\n"
@@ -586,8 +600,18 @@ def test_errors_found_after_reading_name_file_row_and_column_all_at_once(tmp_pat
     assert [line.partition(" (")[0] for line in str(error.value).splitlines()] == [
         "cell.toml: 'jobs.csv', row 4, column places: no arm can do 'b' with 2 kg",
         "cell.toml: 'jobs.csv', row 5, column payload: no arm can do 'c' with 9 kg",
-        "cell.toml: 'jobs.csv', row 6, column places: no arm can do 'd' with 0 kg",
     ]
+    assert str(error.value).splitlines()[0].endswith(" The same holds for 'd' ('jobs.csv', row 6, column places).")
+    rows = [f"part_{number},hold,shelf,{number / 10}" for number in range(8)]
+    (tmp_path / "jobs.csv").write_text("\n".join(["name,kind,places,payload", *rows]), encoding="utf-8")
+    with pytest.raises(ScenarioError) as error:
+        prepare(with_table(tmp_path / "cell.toml", far, "jobs.csv"), difficulty="blind", cache=plans)
+    (line,) = str(error.value).splitlines()
+    assert line.startswith("cell.toml: 'jobs.csv', row 2, column places: no arm can do 'part_0' with 0 kg (")
+    assert line.endswith(
+        "The same holds for 7 other jobs, 'part_1' ('jobs.csv', row 3, column places) to 'part_7' ('jobs.csv', row 9, "
+        "column places)."
+    )
 
 
 def test_the_name_of_a_table_and_blank_rows_change_no_hash(tmp_path):

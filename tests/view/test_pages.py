@@ -259,7 +259,7 @@ def test_a_moved_and_turned_arm_reaches_what_the_lines_to_paste_say(open_page) -
     first, *_ = load("quickstart").arms
     scenario = replace(load("quickstart"), arms=(replace(first, tilt_deg=(90.0, 10.0, 170.0)),))
     empty = {"exclusions": (), "at_once": (), "problems": ()}
-    near = Reach(arm=first.name, place="belt", payload_kg=None, lacks_m=0.0)  # within reach, but not with this tool
+    near = Reach(arm=first.name, place="belt", payload_kg=None, lacks_m=None)  # within reach, but not with this tool
     report = LayoutReport(scenario="a", clearance_m=0.0, reach=(near,), excluded_share=0.0, largest=True, **empty)
     page = open_page(plan_page(scenario, report))
     assert page.locator("#changes").input_value() == ""
