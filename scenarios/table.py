@@ -203,7 +203,7 @@ class Table:
         Console(file=text, width=120).print(self)
         return text.getvalue().rstrip("\n")
 
-    def __rich_console__(self, _: "Console", options: "ConsoleOptions") -> "RenderResult":
+    def __rich_console__(self, console: "Console", options: "ConsoleOptions") -> "RenderResult":
         yield self.rich(options.max_width)
 
     def html(

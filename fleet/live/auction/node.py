@@ -57,7 +57,8 @@ class EpochCheck:
         """Start; no arm is admitted yet.
 
         Args:
-            hold_s: Real seconds for which no job is awarded unless all arms have sent their history.
+            hold_s: Real seconds, from the first present arm, for which no job is awarded unless all arms have sent
+                their history.
         """
         self._link, self._auctioneer = link, auctioneer
         self._asked_s: dict[str, float] = {}
@@ -65,11 +66,11 @@ class EpochCheck:
         self._admitted: set[str] = set()
         self._replied: set[str] = set()
         """Arms that have been admitted since the start."""
-        self._hold_until_s = time.monotonic() + hold_s
+        self._hold_s, self._hold_until_s = hold_s, math.inf if hold_s else -math.inf
         self._foreign: dict[str, str] = {}
         """Why the history of an arm does not fit, by arm."""
         self.unreadable: dict[str, str] = {}
-        """Why the history of an arm cannot be read, by arm: it gets no jobs."""
+        """Why an arm that replies without a valid history gets no jobs, by arm."""
 
     @property
     def objection(self) -> str:
@@ -82,6 +83,8 @@ class EpochCheck:
         Request missing histories.
         """
         arms = frozenset(arms)
+        if arms:
+            self._hold_until_s = min(self._hold_until_s, time.monotonic() + self._hold_s)
         for arm in sorted(arms - self._admitted):
             self._ask(arm)
         return frozenset() if self.objection or self.awaited(arms) else arms & self._admitted
@@ -105,12 +108,12 @@ class EpochCheck:
         self._asked_s[arm] = real_s
 
         def done(replies: Replies[History]) -> None:
-            if "" in replies.refused.values():  # it did not reply in time
+            if "" in replies.refused.values() or replies.temporary:  # it did not reply in time, or not yet
                 return
             for reason in replies.refused.values():
                 if arm not in self.unreadable:
-                    self.unreadable[arm] = f"has a history that cannot be read ({reason.rstrip('.')})"
-                    _LOG.error("'%s' %s: it gets no jobs. Update it.", arm, self.unreadable[arm])
+                    self.unreadable[arm] = f"gives no valid history ({reason.rstrip('.')})"
+                    _LOG.error("'%s' %s: it gets no jobs.", arm, self.unreadable[arm])
                 return
             for history in replies.messages.values():
                 if not self._accept(history):
@@ -338,7 +341,7 @@ class AuctionNode(JobDesk):
             return trouble
         if not alone:
             return "It is being checked whether the fleet has another auctioneer."
-        waits = ", ".join(sorted(self._epochs.awaited(self.present) or self.present))
+        waits = ", ".join(sorted(self._epochs.awaited(self.present) or self.present)) if self.present else ""
         return f"It is not known yet which jobs have been done by {waits}." if waits else ""
 
     def _trouble(self) -> str:

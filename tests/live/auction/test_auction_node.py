@@ -424,7 +424,7 @@ def test_an_auctioneer_of_another_name_leaves_a_last_cycle_in_progress_unfinishe
     assert (fleet.begun, fleet.states("a")) == ({"a": 1}, {"unfinished"})
 
 
-@pytest.mark.parametrize("case", ["late", "absent"])
+@pytest.mark.parametrize("case", ["late", "absent", "rival"])
 def test_an_older_copy_awards_nothing_before_all_arms_have_told_what_they_have_done(fleet_of, monkeypatch, case):
     fleet, copy, arm = begun_after_copy(fleet_of, job("a", 1, **LONG))
     others = [each for each in fleet.arms if each != arm]
@@ -441,6 +441,11 @@ def test_an_older_copy_awards_nothing_before_all_arms_have_told_what_they_have_d
             before.setattr(fleet.world, "send", fleet.world.send)
             fleet.lose(f"{arm}/history")
             restore(fleet, copy)
+            fleet.run(0.2)
+            if case == "rival":  # it asks no arm while another auctioneer is online
+                boss(fleet).rivals.add("boss_2")
+                fleet.run(HOLD_S + 5.0)
+                boss(fleet).rivals.clear()
             fleet.run(3.0)
     fleet.until(lambda: bool(boss(fleet)._epochs._replied))
     fleet.run(3.0)
@@ -472,7 +477,7 @@ def test_an_arm_with_a_malformed_history_stops_no_other_and_is_named(fleet_of):
     fleet.submit(job("a", 1))
     fleet.until(lambda: fleet.is_everywhere("a", "finished"))
     status = fleet.ask(STATUS, StatusRequest(), Status)
-    assert "has a history that cannot be read (Not a" in status.left_out["arm_0"]
+    assert "gives no valid history (Not a" in status.left_out["arm_0"]
     assert "arm_0" not in boss(fleet).auctioneer.rounds.present
     updated.append("arm_0")
     fleet.until(lambda: "arm_0" in boss(fleet).auctioneer.rounds.present)
