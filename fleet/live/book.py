@@ -731,13 +731,13 @@ class JobBook(TimedState[BookRecord]):
         return changed
 
     def _adopt(self, record: HistoryAdopted) -> list[JobEntry]:
-        """Apply what an arm has finished; return the waiting and awarded jobs that need no arm any more."""
+        """Apply what an arm has finished; return the open and unfinished jobs that need no arm any more."""
         changed: list[JobEntry] = []
         for job in record.finished:
             known = job.name in self.jobs
             self._accept(JobsAccepted((job,), f"adopted from {record.arm}", record.time_s))
             entry = self.jobs.get(job.name)
-            if entry is None or entry.state not in ("waiting", "awarded"):
+            if entry is None or entry.state not in ("waiting", "awarded", "unfinished"):
                 continue
             reason = f"'{record.arm}' had finished it; the journal did not know it."
             end = (NO_AWARD, record.arm, "finished", job.repetitions, record.time_s, reason)

@@ -131,7 +131,11 @@ def adopted(book: JobBook, history: History) -> list[BookRecord]:
             return job.name not in book.past
         return entry.state in states and (entry.spec is None or is_same_work(entry.spec, job))
 
-    unknown = tuple(job for job in history.finished if is_open(job, "waiting", "awarded"))
+    def is_unfinished(job: JobSpec) -> bool:
+        """Return whether a job is unfinished and no arm has it: another arm may have finished it since."""
+        return job.name in book.jobs and is_open(job, "unfinished") and book.jobs[job.name].grant is None
+
+    unknown = tuple(job for job in history.finished if is_open(job, "waiting", "awarded") or is_unfinished(job))
     if unknown:
         records.append(HistoryAdopted(history.arm, unknown, book.time_s))
     done = {job.name for job in unknown}

@@ -270,6 +270,26 @@ def test_a_stopped_arm_returns_its_job_as_sure(make):
     assert not arm.ask(award(again.quote, name="w2")).accepted
 
 
+@pytest.mark.parametrize("has_begun", [False, True])
+def test_a_stopped_arm_returns_as_sure_a_permitted_job_whose_last_cycle_has_not_begun(make, has_begun):
+    """Also far from home; after the last cycle has begun, only the next start returns it, as unsure."""
+    arm = make(speed=1.0)
+    arm.line.serve = lambda until_s: setattr(arm._clock, "passed_s", until_s)
+    arm.assign(replace(JOB, repetitions=1))
+    arm.until(lambda: arm.body.away is not None and (arm.body.last_cycle_in_s() == 0.0) == has_begun)
+    (active,) = arm.node.executor.active
+    assert active.may_commit
+    arm.node.retire(arm.real_s + 1.0)
+    assert arm.body.away is not None
+    assert [(report.outcome, report.cycles, report.unsure) for report in arm.line.reports] == (
+        [] if has_begun else [("returned", 0, False)]
+    )
+    reports = ArmHistory().replay(arm.disk.records).after_restart("arm_0", 0.0).reports.values()
+    assert [report.unsure for _, report in reports] == [True] * has_begun
+    arm.until(lambda: arm.body.away is None)
+    assert ("finish" in arm.kinds()) == has_begun
+
+
 def test_a_stopped_arm_at_home_leaves_once_it_has_quoted_that_it_takes_no_space(make):
     """Otherwise its space would stay closed to the others until a person clears it."""
     arm, quotes = make(), []

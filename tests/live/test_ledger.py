@@ -186,6 +186,28 @@ def test_a_job_that_an_arm_finished_without_permission_here_is_one_that_an_older
     assert bool(book.open) == permitted
 
 
+@pytest.mark.parametrize("unsure_first", [False, True])
+@pytest.mark.parametrize("is_known", [False, True])
+def test_an_older_copy_adopts_a_finished_job_that_another_arm_is_unsure_of(unsure_first, is_known):
+    """A person had it redone, which the copy lacks."""
+    book = JobBook(name="boss").replay([JobsAccepted((spec("a"),), "test", 0.0)] if is_known else [])
+    unsure = History("arm_0", "", committed=(JobOutcome("a", "0:a", "arm_0", "unfinished", 3, 1.0),))
+    finished = History("arm_1", "", (spec("a"),))
+    histories = (unsure, finished) if unsure_first else (finished, unsure)
+    for history in histories:
+        book.replay(adopted(book, history))
+    (status,) = book.status()
+    assert (status.state, status.arm, status.cycles) == ("finished", "arm_1", 4)
+    assert [adopted(book, history) for history in histories] == [[], []]
+
+
+def test_a_job_that_its_silent_arm_may_still_finish_stays_unfinished():
+    book = ledger(spec("a"))
+    for record in (award("a"), CommitPermitted("0:a", 2.0), ContactLost("0:a", 8.0)):
+        book.apply(record)
+    assert adopted(book, History("arm_1", "", (spec("a"),))) == []
+
+
 @pytest.mark.parametrize(
     ("number", "arm", "permitted", "state", "has"),
     [

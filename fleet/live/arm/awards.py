@@ -496,9 +496,9 @@ class AwardExecutor:
             self._close(active, "returned", time_s, now_s, reason, faulted=faulted and number == 0)
 
     def stop(self, time_s: float, now_s: float, reason: str) -> None:
-        """Return every award, as the arm stops; one with permission to commit only once its last cycle has ended.
+        """Return every award without permission to commit, as the arm stops; revoke the others.
 
-        It is returned at home if that cycle was not begun. Otherwise the next start returns it as unsure.
+        The caller returns those whose last cycle has not begun. The next start returns the others as unsure.
         """
         for active in self.active:
             if active.may_commit:

@@ -429,11 +429,11 @@ class ArmNode:
     def retire(self, until_s: float) -> None:
         """Return all awards, report them until they are acknowledged, and quote the space of an arm at home.
 
-        A last cycle in progress ends first; an award that is left returns at the next start.
+        A last cycle that has begun ends first; an award that is left returns at the next start.
         The last state says that the arm leaves. At the latest it ends when `time.monotonic()` is `until_s`.
         """
         self._leaving = True
-        self.executor.stop(self._body.time_s, time.monotonic(), "The arm was stopped.")
+        self._stop_awards("The arm was stopped.")
         reported_s = time.monotonic() if self.executor.has_pending_reports else -math.inf
         while time.monotonic() < until_s:
             if self.executor.has_pending_reports:
@@ -442,6 +442,18 @@ class ArmNode:
                 break
             self.serve(min(until_s, time.monotonic() + POLL_S))
         self._send_state()
+
+    def _stop_awards(self, reason: str) -> None:
+        """Return all awards, except for the current one if its last cycle may have begun."""
+        real_s = time.monotonic()
+        self.executor.stop(self._body.time_s, real_s, reason)
+        if (current := self._current) is None:
+            return
+        if self._body_award == current.award.award:
+            self._body.allow_cycles(self.executor.allowed_cycles(real_s))  # from now on it begins none
+            if not 0.0 < self._body.last_cycle_in_s() < math.inf:
+                return
+        self.executor.return_all(self._body.time_s, real_s, reason)
 
     # Requests
 
