@@ -327,6 +327,39 @@ def test_a_restored_copy_of_a_granter_from_before_its_last_start_is_noticed(flee
     assert (processes[granter].up, fleet.begun) == (False, {"a": 1})
 
 
+@pytest.mark.parametrize("new_epoch", [False, True])
+def test_an_arm_that_lost_its_grants_does_not_take_the_epoch_from_a_minority(fleet_of, new_epoch):
+    """Else it would join without the jobs that it has lost: `arm_4` knows the epoch, but no claim of `arm_0`."""
+    fleet = fleet_of(True, 5, trace=True, only=("arm_1", "arm_2", "arm_3", "arm_4"))
+    processes = fleet.world.processes
+    fleet.until(lambda: begun(fleet, "arm_1", "arm_2", "arm_3", "arm_4"))
+    processes["arm_4"].kill("is stopped")
+    processes["arm_0"].start()
+    fleet.run(5.0)
+    processes["arm_3"].kill("is stopped")
+    fleet.run(3.0)
+    fleet.submit(job("a", 1))
+    fleet.until(lambda: fleet.is_everywhere("a", "finished"))
+    for arm in ("arm_0", "arm_1", "arm_2"):
+        processes[arm].kill("is stopped")
+    lose_files(fleet, "arm_0", "grants")
+    fleet.builders["arm_0"].new_epoch = new_epoch
+    processes["arm_4"].start()
+    fleet.run(3.0)
+    processes["arm_0"].start()
+    fleet.run(5.0)
+    assert not fleet.node("arm_0").work_source.book.epoch
+    processes["arm_1" if new_epoch else "arm_3"].start()
+    if new_epoch:
+        fleet.until(lambda: begun(fleet, "arm_0", "arm_1", "arm_4"))
+        assert fleet.node("arm_0").work_source.book.is_settled("a")
+        assert "finished already" in fleet.submit(job("a", 1))[0].reason
+    else:
+        fleet.until(lambda: not processes["arm_0"].up)
+        assert fleet.logged("exits: 'arm_3' knows claims of 'arm_0' that its journals do not")
+    assert fleet.begun == {"a": 1}
+
+
 @pytest.mark.parametrize("outcome", ["done", "redo"])
 @pytest.mark.parametrize("cleared", ["never", "before", "after"])
 def test_a_job_lost_in_its_last_cycle_is_settled_at_an_arm_that_was_cut_off_meanwhile(fleet_of, cleared, outcome):

@@ -162,13 +162,16 @@ class ConsensusNode(JobDesk):
     # Inside
 
     def _join(self, histories: tuple[History, ...]) -> None:
-        """Check what the peers know, and adopt what this arm has lost.
+        """Check what the peers know; with a majority, adopt what this arm has lost, and take the epoch.
 
         Raises:
             BusError: jobs might be done twice.
         """
         granter, number = self.participant.granter, self._first_number
         check_journals(self._name, number, self._epoch, histories, new_epoch=self._new_epoch)
+        # A minority may not know the claims of this arm. With an epoch, lost journals would not be noticed later.
+        if len({each.arm for each in histories} | {self._name}) < self._majority:
+            return
         known = max((history.claims.get(self._name, -1) for history in histories), default=-1)
         if known >= number or (known >= 0 and not self._epoch):
             _LOG.warning("Arm '%s' adopts what %d arm(s) have done and have.", self._name, len(histories))
@@ -176,8 +179,7 @@ class ConsensusNode(JobDesk):
                 granter.adopt(adopted(self.book, history), time.monotonic())
             self.participant.count_after(known)
         self._take_epoch(next((history.epoch for history in histories if history.epoch), ""))
-        # Fewer than a majority may not know of an epoch, or of claims of this arm, that the others know.
-        self._joined = len({each.arm for each in histories} | {self._name}) >= self._majority
+        self._joined = True
 
     def _ask_peers(self, real_s: float) -> None:
         """Ask all peers what they know, before this arm takes or names an epoch, claims or grants."""
