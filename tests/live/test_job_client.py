@@ -148,11 +148,11 @@ def test_whoever_forgets_a_job_hears_no_more_of_it(place):
 
 
 def test_to_ask_gets_a_reply_a_refusal_or_none(place):
-    here = place(by="mallory")
+    here, key = place(by="mallory"), keys.of_jobs("f", "status")
     with serving(here.other):
+        assert here.link.wait_for_queryable(key, PATIENCE_S)  # the other one was declared before
         with pytest.raises(Refused, match="No room"):
             here.client.submit_and_wait([JOB])
-        key = keys.of_jobs("f", "status")
         assert here.link.ask(key, StatusRequest(), Status, timeout_s=PATIENCE_S).auctioneer == "boss"
     with pytest.raises(NoReply, match="in time"):  # the thread may still have dropped a first request
         here.link.ask(key, StatusRequest(), Status, timeout_s=0.1, attempts=3)
