@@ -4,7 +4,7 @@ The epoch is the name of a journal of the auctioneer, which arms get with every 
 counts as present, the auctioneer asks what it has finished and what it has. If an arm knows another epoch, the journal
 was lost: no jobs are accepted, unless a new epoch was requested. Then the auctioneer adopts what the arms know.
 
-An older copy of the journal lacks what was done since. So after a restart no job is awarded until all arms have told
+An older copy of the journal lacks what was done since. So after a restart no job is awarded until all arms have sent
 what they have finished, what they have, and what they may have done: such a job is unfinished, and a person settles it.
 The auctioneer waits for at most 20 s: what only an arm knows that comes online later may be done again.
 
@@ -14,7 +14,7 @@ the present arms have done and have. An arm takes part only after a majority, wi
 Peers record the first claim of each start: an older copy is noticed only if a replying peer knows a later start.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from statistics import median_high
 
 from fleet.bus.client import BusClient
@@ -125,73 +125,93 @@ def adopted(book: JobBook, history: History) -> list[BookRecord]:
     records: list[BookRecord] = []
     if history.epoch and not book.epoch:
         records.append(EpochBegun(history.epoch))
-
-    def is_open(job: JobSpec, *states: JobState) -> bool:
-        if (entry := book.jobs.get(job.name)) is None:
-            return job.name not in book.past
-        return entry.state in states and (entry.spec is None or is_same_work(entry.spec, job))
-
-    def is_unfinished(job: JobSpec) -> bool:
-        """Return whether a job is unfinished and no arm has it: another arm may have finished it since."""
-        return job.name in book.jobs and is_open(job, "unfinished") and book.jobs[job.name].grant is None
-
-    unknown = tuple(job for job in history.finished if is_open(job, "waiting", "awarded") or is_unfinished(job))
+    unknown = tuple(job for job in history.finished if _is_unknown(book, job))
     if unknown:
         records.append(HistoryAdopted(history.arm, unknown, book.time_s))
+    records += _finished_last_cycles(book, history)
     done = {job.name for job in unknown}
-    held = {award.award for award in history.awards}
-    for job in history.finished:  # an older copy lacks the report of the arm that had permission to commit
-        entry = book.jobs.get(job.name)
-        grant = None if entry is None or not is_open(job, "finishing", "unfinished") else entry.grant
-        if grant is None or not grant.may_commit or grant.record.arm != history.arm:
-            continue
-        if grant.record.award not in held:
-            reason = f"'{history.arm}' had finished it; the journal did not know it."
-            terms = (grant.record.award, history.arm, "finished", job.repetitions, book.time_s, reason)
-            records.append(JobSettled(JobOutcome(job.name, *terms)))
     for award in history.awards:
-        permitted = award.award in history.may_commit
-        if award.job.name in done:
-            continue
-        if award.auctioneer != book.name:  # it reports the end of the award to an auctioneer that is gone
-            reason = f"'{history.arm}' has permission to commit from another auctioneer, '{award.auctioneer}'."
-            terms = (award.award, history.arm, "unfinished", award.cycles, book.time_s, reason)
-            lost = JobOutcome(award.job.name, *terms)
-            if permitted and is_open(award.job, "waiting", "awarded") and book.is_news(lost):
-                records.append(JobsAccepted((award.job,), f"adopted from {history.arm}", book.time_s))
-                records.append(JobSettled(lost))
-            continue
-        states: tuple[JobState, ...] = ("waiting", "awarded") if permitted else ("waiting",)
-        if (grant := book.open.get(award.award)) is not None:
-            own = (grant.record.arm, grant.record.job) == (history.arm, award.job.name)
-            if own and permitted and not grant.may_commit:
-                records.append(CommitPermitted(award.award, book.time_s, award.cycles))
-        elif book.grant_of(award.award) is None and is_open(award.job, *states):
-            records.append(JobsAccepted((award.job,), f"adopted from {history.arm}", book.time_s))
-            records.append(_adopted_award(award, history, book.time_s))
+        if award.job.name not in done:
+            records += _of_award(book, history, award)
     for outcome in history.committed:
-        if book.is_central:  # an older copy lacks a report that it had received
-            if not book.is_settled(outcome.job) and book.is_news(outcome):
-                records.append(JobSettled(outcome))
-            continue
-        entry = book.jobs.get(outcome.job)
-        grant = None if entry is None else entry.grant
-        if book.is_settled(outcome.job) or (grant is not None and grant.may_commit):
-            continue
-        before = book.grant_of(outcome.award, outcome.job)
-        is_over = before is not None and before.outcome not in ("", "dropped")  # its arm has reported or released it
-        if is_over or outcome.award in book.operations.redone(outcome.job):
-            continue
-        if outcome.arm == book.name:  # it may have done the last cycle, and does not know
-            records.append(JobSettled(outcome))
-            continue
-        if grant is not None and (grant.record.arm, grant.record.award) == (outcome.arm, outcome.award):
-            records.append(CommitPermitted(outcome.award, book.time_s, outcome.cycles))
-        else:
-            terms = (outcome.award, outcome.job, outcome.arm, book.time_s, outcome.cycles, (outcome.job,))
-            records.append(Granted(*terms, may_commit=True))
-        records.append(ClaimNumbered(outcome.arm, history.claims.get(outcome.arm, 0)))
+        records += _unreported(book, outcome) if book.is_central else _of_commit(book, history, outcome)
     return records
+
+
+def _is_open(book: JobBook, job: JobSpec, *states: JobState) -> bool:
+    """Return whether a job is new here, or in one of these states with the same work."""
+    if (entry := book.jobs.get(job.name)) is None:
+        return job.name not in book.past
+    return entry.state in states and (entry.spec is None or is_same_work(entry.spec, job))
+
+
+def _is_unknown(book: JobBook, job: JobSpec) -> bool:
+    """Return whether it is unknown here that a job is finished: it is open, or unfinished and no arm has it."""
+    entry = book.jobs.get(job.name)
+    unfinished = entry is not None and entry.grant is None and _is_open(book, job, "unfinished")
+    return unfinished or _is_open(book, job, "waiting", "awarded")
+
+
+def _finished_last_cycles(book: JobBook, history: History) -> Iterator[BookRecord]:
+    """Yield the end of jobs that the arm had permission to commit: an older copy lacks its report."""
+    held = {award.award for award in history.awards}
+    for job in history.finished:
+        entry = book.jobs.get(job.name)
+        grant = None if entry is None or not _is_open(book, job, "finishing", "unfinished") else entry.grant
+        if grant is None or not grant.may_commit or grant.record.arm != history.arm or grant.record.award in held:
+            continue
+        reason = f"'{history.arm}' had finished it; the journal did not know it."
+        terms = (grant.record.award, history.arm, "finished", job.repetitions, book.time_s, reason)
+        yield JobSettled(JobOutcome(job.name, *terms))
+
+
+def _of_award(book: JobBook, history: History, award: Award) -> Iterator[BookRecord]:
+    """Yield what an award that the arm has changes here."""
+    permitted = award.award in history.may_commit
+    accepted = JobsAccepted((award.job,), f"adopted from {history.arm}", book.time_s)
+    if award.auctioneer != book.name:  # it reports the end of the award to an auctioneer that is gone
+        reason = f"'{history.arm}' has permission to commit from another auctioneer, '{award.auctioneer}'."
+        terms = (award.award, history.arm, "unfinished", award.cycles, book.time_s, reason)
+        lost = JobOutcome(award.job.name, *terms)
+        if permitted and _is_open(book, award.job, "waiting", "awarded") and book.is_news(lost):
+            yield accepted
+            yield JobSettled(lost)
+        return
+    states: tuple[JobState, ...] = ("waiting", "awarded") if permitted else ("waiting",)
+    if (grant := book.open.get(award.award)) is not None:
+        own = (grant.record.arm, grant.record.job) == (history.arm, award.job.name)
+        if own and permitted and not grant.may_commit:
+            yield CommitPermitted(award.award, book.time_s, award.cycles)
+    elif book.grant_of(award.award) is None and _is_open(book, award.job, *states):
+        yield accepted
+        yield _adopted_award(award, history, book.time_s)
+
+
+def _unreported(book: JobBook, outcome: JobOutcome) -> Iterator[BookRecord]:
+    """Yield an unsure end that the arm has reported: an older copy lacks the report."""
+    if not book.is_settled(outcome.job) and book.is_news(outcome):
+        yield JobSettled(outcome)
+
+
+def _of_commit(book: JobBook, history: History, outcome: JobOutcome) -> Iterator[BookRecord]:
+    """Yield what a permission to commit changes that the arm has given, without an auctioneer."""
+    entry = book.jobs.get(outcome.job)
+    grant = None if entry is None else entry.grant
+    if book.is_settled(outcome.job) or (grant is not None and grant.may_commit):
+        return
+    before = book.grant_of(outcome.award, outcome.job)
+    is_over = before is not None and before.outcome not in ("", "dropped")  # its arm has reported or released it
+    if is_over or outcome.award in book.operations.redone(outcome.job):
+        return
+    if outcome.arm == book.name:  # it may have done the last cycle, and does not know
+        yield JobSettled(outcome)
+        return
+    if grant is not None and (grant.record.arm, grant.record.award) == (outcome.arm, outcome.award):
+        yield CommitPermitted(outcome.award, book.time_s, outcome.cycles)
+    else:
+        terms = (outcome.award, outcome.job, outcome.arm, book.time_s, outcome.cycles, (outcome.job,))
+        yield Granted(*terms, may_commit=True)
+    yield ClaimNumbered(outcome.arm, history.claims.get(outcome.arm, 0))
 
 
 def _adopted_award(award: Award, history: History, time_s: float) -> Granted:
