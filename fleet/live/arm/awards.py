@@ -21,7 +21,7 @@ import logging
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypeVar
 
 import msgspec
 from msgspec.structs import replace
@@ -44,6 +44,7 @@ from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.journal import CommitPermitted, JournalState, Progress, Released, Started
 from fleet.live.records import outcome_of
 
+Value = TypeVar("Value")
 MAX_PAST_AWARDS = 256
 """Closed awards whose answer is kept; their quotes expired long ago."""
 MAX_UNSURE = 32
@@ -196,17 +197,11 @@ class ArmHistory(JournalState[ArmRecord]):
                 pass
 
     def _doubt(self, report: Report) -> None:
-        self.unsure.pop(report.job, None)
-        self.unsure[report.job] = report
-        if len(self.unsure) > MAX_UNSURE:
-            del self.unsure[next(iter(self.unsure))]
+        _keep_last(self.unsure, report.job, report, MAX_UNSURE)
 
     def _finish(self, job: JobSpec) -> None:
         self.unsure.pop(job.name, None)
-        self.finished.pop(job.name, None)
-        self.finished[job.name] = job
-        if len(self.finished) > MOST_FINISHED:
-            del self.finished[next(iter(self.finished))]
+        _keep_last(self.finished, job.name, job, MOST_FINISHED)
 
     def compact(self) -> tuple[ArmRecord, ...]:
         """Return the fewest records that give the same history, without closed awards of long ago."""
@@ -257,6 +252,14 @@ def bounded(accepted: dict[str, str], needed: Iterable[str]) -> dict[str, str]:
     keep = set(needed)
     keep.update([name for name in accepted if name not in keep][-MAX_PAST_AWARDS:])
     return {name: job for name, job in accepted.items() if name in keep}
+
+
+def _keep_last(kept: dict[str, Value], name: str, value: Value, most: int) -> None:
+    """Add a value as the newest one; drop the oldest one of more than `most`."""
+    kept.pop(name, None)
+    kept[name] = value
+    if len(kept) > most:
+        del kept[next(iter(kept))]
 
 
 _LOG = logging.getLogger(__name__)
