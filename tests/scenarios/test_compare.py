@@ -59,10 +59,10 @@ def test_names_are_whole_and_no_figure_is_cut_in_80_columns() -> None:
     table = Table(head=HEADS, rows=tuple((name, figure, f"-{figure}", "**", *[figure] * 4) for name in names))
     page = io.StringIO()
     Console(file=page, width=80).print(table)
-    told = page.getvalue()
-    assert max(map(len, told.splitlines())) <= 80
-    assert all(name in told.split() for name in names[:2])
-    assert [told.split().count(part) for part in ("[0.35,", "0.47]")] == [6 * len(names)] * 2
+    text = page.getvalue()
+    assert max(map(len, text.splitlines())) <= 80
+    assert all(name in text.split() for name in names[:2])
+    assert [text.split().count(part) for part in ("[0.35,", "0.47]")] == [6 * len(names)] * 2
     spans = [(name, "217.3", "214.1 … 220.5", "-16.4", "-19.9 … -12.8", "**") for name in names[:2]]
     table = Table.grouped(("", "mean", "interval", "difference", "interval", ""), {"reward": spans})
     Console(file=page, width=66).print(table)
