@@ -51,6 +51,7 @@ def greedy(difficulty: dict[str, dict[str, float]], able: list[str]) -> dict[str
 
 
 @example(29830, 2, 1)  # the bid of one arm came later than the other had chosen
+@example(15098, 5, 3)  # an arm chose by a bid of a peer from before the grant to that peer
 @example(118385827, 2, 2)  # so did that of a faulted arm, by which its peer knows how well each job suits it
 @examples(8)
 @given(st.integers(0, 2**32), st.integers(1, 5), st.integers(1, 4))
@@ -98,6 +99,15 @@ def both_second(arm: str, space: str, other: str, other_space: str) -> bool:
 def drop_choice(handle, arm: str, bid) -> None:
     if not bid.choice:
         handle(arm, bid)
+
+
+def test_an_award_has_the_time_at_which_it_was_granted(fleet_of):
+    """Not that of the last record before it."""
+    fleet = fleet_of(True)
+    fleet.submit(job("a", 1, release_s=200.0))
+    fleet.until(lambda: len(fleet.finished) == 1)
+    times = {each.status.state: each.time_s for arm in fleet.arms for each in fleet.node(arm).work_source.book.recent}
+    assert 200.0 <= times["awarded"] <= times["finished"]
 
 
 def offered(arm: str, name: str) -> tuple:

@@ -313,7 +313,9 @@ class ConsensusNode(JobDesk):
     def _answer_claim(self, claim: Claim) -> ClaimReply:
         if claim.arm == self._name or not (self._begun and self._joined):
             raise AnotherReplies
-        return self.participant.granter.answer_claim(claim, time.monotonic())
+        real_s = time.monotonic()
+        self.book.pass_time(self._arm.clock.now_s(real_s))
+        return self.participant.granter.answer_claim(claim, real_s)
 
     # Requests of others: all arms receive them, and the first present one replies
 

@@ -119,6 +119,8 @@ class Participant:
         self._number = boot * NUMBERS_PER_BOOT
         self._bids: dict[str, tuple[Bid, float]] = {}
         """Last bid of each arm, and its real second."""
+        self._granted: dict[str, set[str]] = {}
+        """Awards that this arm had granted to each arm when its last bid came."""
         self._present: frozenset[str] = frozenset()
         self._bid_s = self._chosen_s = self._changed_s = -math.inf
         self._waiting_s = math.inf
@@ -156,7 +158,7 @@ class Participant:
         before = self._bids.get(bid.arm)
         if bid.arm not in self.granter.roster or (before is not None and bid.number < before[0].number):
             return
-        self._bids[bid.arm] = bid, real_s
+        self._bids[bid.arm], self._granted[bid.arm] = (bid, real_s), self.granter.granted_to(bid.arm)
         self._refusals.note(bid)
         if before is None or _offered(before[0]) != _offered(bid):
             self._changed_s, self._new_bids = real_s, True
@@ -210,6 +212,7 @@ class Participant:
     def tick(self, real_s: float, time_s: float) -> None:
         """Do what is due."""
         self._time_s = time_s
+        self.book.pass_time(time_s)
         self._obey(real_s)
         for job in self.claimant.rejected:
             self._lost = True
@@ -402,8 +405,12 @@ class Participant:
 
     def _bidding(self, bids: dict[str, Bid], names: Iterable[str]) -> Bidding:
         """Return the bids for some jobs as in a round of an auctioneer."""
-        quotes = {arm: self._sensors[arm].check_quote(_quote(bid, self.states.get(arm))) for arm, bid in bids.items()}
         book, paused = self.book, self.book.operations.paused
+        quotes: dict[str, Quote] = {}
+        for arm, bid in bids.items():
+            gained = self.granter.granted_to(arm) - self._granted[arm]
+            bid = replace(bid, capacity=max(0, bid.capacity - len(gained)))
+            quotes[arm] = self._sensors[arm].check_quote(_quote(bid, self.states.get(arm)))
         entries = [book.jobs[name] for name in dict.fromkeys(names) if name in book.jobs]
         unfit = {arm: why for arm in bids if (why := self._sensors[arm].why_unfit)}
         return Bidding(
