@@ -18,9 +18,9 @@ from benchmarks.simulation.machine import SimulatedEstimator
 from benchmarks.simulation.participants import CLIENT, simulated_system
 from benchmarks.simulation.simulated_fleet import FIRST
 from fleet.bus.client import AnotherReplies
-from fleet.bus.protocol.auction import Ack, Award
-from fleet.bus.protocol.keys import of_arm
-from fleet.bus.protocol.operator import Settle
+from fleet.bus.protocol.auction import Ack, Award, Status, StatusRequest
+from fleet.bus.protocol.keys import of_arm, of_jobs
+from fleet.bus.protocol.operator import Pause, Settle
 from fleet.errors import BusError
 from fleet.live.consensus.node import ConsensusNode
 from scenarios.live.arm import refuse_auctioneer
@@ -420,7 +420,7 @@ def test_without_a_majority_no_job_is_accepted(fleet_of):
     fleet.world.split({"arm_2": 1, CLIENT: 1})
     fleet.run(12.0)
     here, there = (job("a", 2, place=place, release_s=1000.0) for place in ("here", "there"))
-    reason = "A majority of the arms, 2, must be present. Submit it again then."
+    reason = "1 of 3 arms present: a majority, 2, is needed. Submit it again then."
     assert refused(lambda: fleet.submit(here)) == reason
     assert fleet.known() == [{}, {}, {}]
     fleet.world.split({"arm_2": 1})
@@ -442,3 +442,25 @@ def test_an_arm_that_restarts_without_a_majority_replies_to_clients_and_neither_
     assert not fleet.node("arm_0").work_source.participant.claimant._sent
     fleet.world.processes["arm_2"].start()
     fleet.until(lambda: bool(fleet.node("arm_0").work_source.participant.claimant._sent))
+
+
+def status_of(fleet: SimulatedFleet) -> Status:
+    return fleet.ask(of_jobs("f", "status"), StatusRequest(), Status)
+
+
+def test_the_first_arms_of_a_fleet_say_that_they_are_too_few():
+    """Before a majority has begun the fleet's time, clients get the reason instead of no reply."""
+    fleet = SimulatedFleet(True, 4)
+    with simulated_system(fleet.world):
+        for name in (CLIENT, "arm_1", "arm_2"):
+            fleet.world.processes[name].start()
+        fleet.run(12.0)
+        reason = "2 of 4 arms present: a majority, 3, is needed."
+        reply = status_of(fleet)
+        assert (reply.auctioneer, reply.trouble, reply.time_s) == ("arm_1", reason, 0.0)
+        assert refused(lambda: fleet.submit(job("a", 1))) == f"{reason} Submit it again then."
+        assert refused(lambda: fleet.control(Pause("arm_1"))) == f"{reason} Ask again then."
+        fleet.world.processes["arm_0"].start()
+        fleet.until(lambda: begun(fleet, "arm_0"))
+        assert status_of(fleet).trouble == ""
+        assert fleet.submit(job("a", 1))[0].accepted

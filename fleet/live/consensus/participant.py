@@ -52,7 +52,7 @@ QUIET_S = 0.05
 """Real seconds without a new bid or choice, after which all arms most likely have the same bids."""
 BID_S = 1.0
 """Real seconds between two bids in which only the costs differ."""
-TOO_FEW = "A majority of the arms, {}, must be present."
+TOO_FEW = "{} of {} arms present: a majority, {}, is needed."
 """Why no job is granted or accepted."""
 NO_CHOICE = Choice("")
 MAX_PAUSES = 4096
@@ -275,15 +275,15 @@ class Participant:
         bids = self._fresh_bids(real_s)
         offered = {offer.job for bid in bids.values() for offer in bid.estimates}
         bidding = self._bidding(bids, offered) if bids else None
-        fewer = len(self._present | {self.name}) < self.claimant.majority
+        present, roster, majority = self._present | {self.name}, self.granter.roster, self.claimant.majority
         busy, book = self.book.busy_stations(), self.book
 
         def why(job: JobSpec) -> str:
             not_ready = why_not_ready(job, self._time_s, book.is_finished, busy)
             if reason := self._refusal(job.name) or not_ready:
                 return reason
-            if fewer:
-                return TOO_FEW.format(self.claimant.majority)
+            if len(present) < majority:
+                return TOO_FEW.format(len(present), len(roster), majority)
             if bidding is None or job.name not in offered:
                 return NOT_OFFERED.format(self._slots)
             return reason_to_wait(bidding, job.name)
