@@ -116,7 +116,7 @@ WRONG = [
     (put("jobs", 0, "places", [["bench"], ["bench"]]), "jobs[0].places must name each alternative once (got [('bench"),
     (put("jobs", 0, "places", [["bench"], ["shlf"]]), "jobs[0].places: no place 'shlf'; did you mean 'shelf'?"),
     (put("jobs", 1, "places", [["bench", "shelf"], []]), "two different places, from and to, for a sort (got none)."),
-    (put("jobs", 0, "force_n", 3), "jobs[0].force_n: only a press has a contact force (got 3.0 N)."),
+    (put("jobs", 0, "force_n", 3), "jobs[0].force_n must be 0 or left out: only a press has a contact force (got 3 N"),
     (put("jobs", 0, "repetitions", [5, 2]), "jobs[0].repetitions must be [fewest, most] (got 5, 2)."),
     (put("jobs", 0, "repetitions", [1, 10**30]), "jobs[0].repetitions must be between 1 and 100000 (got 1"),
     (put("jobs", 0, "after", ["hold"]), "jobs[0].after: there is no stream 'hold' above this one."),
