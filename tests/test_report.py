@@ -6,7 +6,7 @@ import gzip
 import json
 import math
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from html.parser import HTMLParser
 from itertools import pairwise
 from typing import Any
@@ -24,7 +24,9 @@ from fleet.telemetry import Telemetry
 from scenarios.run.records import Halt, ShiftLog
 from scenarios.show.charts import decimate
 from scenarios.show.run_page import (
+    LONG_SETTINGS,
     ROWS,
+    SETTINGS,
     figure_table,
     other_choices,
     report_html,
@@ -33,6 +35,7 @@ from scenarios.show.run_page import (
 )
 from scenarios.show.timeline import shift_charts, stream_of
 from scenarios.show.words import duration, offer_text, value_text
+from scenarios.spec.options import RunSpec
 from tests.recorded_shifts import done, event, log_of, offered, record, shift, telemetry
 
 ARMS = ("arm_0", "arm_1")
@@ -513,12 +516,21 @@ PLAIN = shift(card={"scenario": {"name": "busy"}, "scenario_hash": "1a", "seed":
             "seed and jobs. They have other jobs: their figures compare no policies.",
         ),
         (of_card(PLAIN, code_hash="3c"), "code. All have the same jobs."),
+        (of_card(PLAIN, plant="mujoco", bus="zenoh", risk="none"), "risk, plant and bus. All have the same jobs."),
+        (of_card(PLAIN, channel={"loss": 0.1}), "channel between the arms. All have the same jobs."),
+        (of_card(PLAIN, twins={"arm_a": {"version": "2"}}), "twins. All have the same jobs."),
+        (of_card(PLAIN, difficulty="blind", twins={"arm_a": {}}), "predictions. All have the same jobs."),
     ],
-    ids=["equal", "an arm was moved", "another table", "another file", "another seed", "another version"],
-)
+    ids=["equal", "an arm was moved", "another table", "another file", "another seed", "another version",
+         "another plant", "messages are lost", "other twins", "no twins"],
+)  # fmt: skip
 def test_runs_have_the_same_jobs_by_their_jobs_and_the_same_scenario_by_its_content(other: ShiftLog, said: str) -> None:
     page = runs_page({"one": replace(PLAIN), "other": replace(other)})
     assert f"The runs differ in {said}" in page
+
+
+def test_no_setting_of_a_run_is_left_out_of_the_comparison() -> None:
+    assert {field.name for field in fields(RunSpec)} <= {*SETTINGS, *LONG_SETTINGS}
 
 
 def test_jobs_that_finished_at_other_times_are_the_same_jobs() -> None:
