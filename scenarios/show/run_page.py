@@ -23,7 +23,16 @@ from scenarios.show.late_jobs import (
 )
 from scenarios.show.page import Badge, Chart, Head, Page, Playback, Section, packed
 from scenarios.show.timeline import STREAM_NAME, hottest_motors, shift_charts, time_unit
-from scenarios.show.words import clock, duration, kind_text, names_text, offer_text, offers_text, value_text
+from scenarios.show.words import (
+    clock,
+    duration,
+    joined_breaks,
+    kind_text,
+    names_text,
+    offer_text,
+    offers_text,
+    value_text,
+)
 from scenarios.table import Column, Moment, Table, render
 
 MOST_FAULTS = 2
@@ -417,7 +426,7 @@ def numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
 
 def _event_section(log: ShiftLog) -> Section:
     """The notable events and notices by time, how many there are, and which are left out."""
-    notable = [e for e in _joined_breaks(log) if e.kind in NOTABLE]
+    notable = [e for e in joined_breaks((*log.events, *log.notices), log.arms) if e.kind in NOTABLE]
     if not notable:
         return Section(key="log", title="Events", sentences=("No fault, no warning, no lost claim.",))
     first = sorted(notable, key=lambda e: (NOTABLE.index(e.kind), e.time_s))
@@ -437,19 +446,6 @@ def _event_section(log: ShiftLog) -> Section:
     kinds, moments = [e.kind for e in listed], [_before(event) for event in listed]
     shown = table.html(style="events", key="events", kinds=kinds, moments=moments)
     return Section(key="log", title="Events", sentences=tuple(sentences), html=shown)
-
-
-def _joined_breaks(log: ShiftLog) -> Iterator[Event | Notice]:
-    """Yield events and notices; the events of arms whose breaks begin, or end, in the same second as one."""
-    breaks = dict[tuple[str, int, str], list[Event | Notice]]()
-    for event in (*log.events, *log.notices):
-        if event.kind in ("break", "break_end"):
-            breaks.setdefault((event.kind, round(event.time_s), event.reason), []).append(event)
-        else:
-            yield event
-    for alike in breaks.values():
-        arms = {each.arm for each in alike}
-        yield replace(alike[0], arm=names_text([arm for arm in log.arms if arm in arms]))
 
 
 def _before(event: Event | Notice) -> Moment:
