@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -58,6 +59,13 @@ class Plan:
     def phases(self) -> tuple[Phase, Phase, Phase]:
         """Approach, cycle, retreat."""
         return (self.approach, self.cycle, self.retreat)
+
+    @cached_property
+    def stops(self) -> Array:
+        """Postures at which the arm stops, float32 [stop, joint]; joint paths between them are straight."""
+        profiles = [distinct(phase.profile) for phase in self.phases]
+        stops = np.concatenate([profile[(profile[:, 1] == 0).all(axis=1), 0] for profile in profiles])
+        return stops[np.append(True, (np.diff(stops, axis=0) != 0).any(axis=1))]
 
     def duration_s(self, repetitions: int) -> float:
         """Time from leaving home to being home again, s."""

@@ -279,8 +279,7 @@ def simulated_system(world: World) -> Iterator[None]:
     replace(supervisor_module, "threading", SimpleNamespace(Thread=Thread, Event=threading.Event))
     replace(journal_module, "COMPACT_BYTES", 5_000)  # so that both happen in a short shift
     replace(book_module, "MAX_SETTLED", 5)
-    replace(arm_module, "plan_key", lambda plan: plan.space)
-    replace(arm_module, "space_name", str)
+    replace(arm_module, "space_name", lambda plan: plan.space)
     try:
         with files, world.installed(), simulated_files(disk):
             yield

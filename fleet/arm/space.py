@@ -6,7 +6,6 @@ have no effect. A table numbers the volumes of a cell.
 """
 
 import hashlib
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from fleet.arm.gen3 import gen3_xml
 from fleet.arm.plan_cache import cached_arrays
 from fleet.arm.time_limit import check_time
 from fleet.job import Work
-from fleet.motion import Plan, distinct
+from fleet.motion import Plan
 from fleet.robot import Robot
 
 if TYPE_CHECKING:
@@ -79,19 +78,36 @@ class SpaceTable:
             )
         return np.array([self.volume[plan_key(plan)] for plan in plans], dtype=int), self.conflicts
 
+    def by_path(self, plans: Sequence[Plan]) -> dict[str, tuple[int, float]]:
+        """Number of the volume of each path that these plans follow, and its heaviest payload, kg; see `path_of`."""
+        volumes: dict[str, tuple[int, float]] = {}
+        for plan, row in zip(plans, self.rows(plans)[0].tolist(), strict=True):
+            path, payload_kg = path_of(space_name(plan))
+            volumes[path] = row, max(payload_kg, volumes.get(path, (row, 0.0))[1])
+        return volumes
+
 
 def plan_key(plan: Plan) -> PlanKey:
     """Key of a plan in a `SpaceTable`."""
     return plan.arm, plan.work, plan.elbow, plan.speed
 
 
-def space_name(key: PlanKey) -> str:
-    """Name of the space of a plan on the bus: a hash of the key, so it is the same in all processes."""
-    arm, work, elbow, speed = key
-    places = [[place.name, *map(float, (*place.position_m, *place.tool_deg, place.retreat_m))] for place in work.places]
-    numbers = [float(value) for value in (work.payload_kg, work.dwell_s, work.force_n, elbow, speed)]
-    content = json.dumps([arm, work.kind, places, numbers])
-    return hashlib.sha256(content.encode()).hexdigest()[:16]
+def space_name(plan: Plan) -> str:
+    """Name of the space of a plan on the bus, the same in all processes: a hash of arm and postures, and the payload.
+
+    So a job has the space of another one with the same motion, whatever its speed and dwell.
+    """
+    path = hashlib.sha256(plan.arm.encode() + plan.stops.tobytes()).hexdigest()[:16]
+    return f"{path}@{float(plan.work.payload_kg)!r}"
+
+
+def path_of(space: str) -> tuple[str, float]:
+    """Path and payload, kg, of the name of a space; payload inf if the name states none."""
+    path, _, payload_kg = space.partition("@")
+    try:
+        return path, float(payload_kg)
+    except ValueError:
+        return space, math.inf
 
 
 def space_table(
@@ -195,7 +211,7 @@ class _Paths:
         for plan in plans:
             if plan.arm != robot.name:
                 continue
-            row = rows.setdefault(_stops(plan).tobytes(), len(rows))
+            row = rows.setdefault(plan.stops.tobytes(), len(rows))
             if row == len(self.plan):
                 self.plan.append(plan)
                 self.heaviest.append(0.0)
@@ -215,15 +231,8 @@ class _Paths:
 
     def content(self) -> dict[str, object]:
         """All that determines the space of the paths, for cache keys."""
-        paths = hashlib.sha256(b"".join(_stops(plan).tobytes() for plan in self.plan)).hexdigest()
+        paths = hashlib.sha256(b"".join(plan.stops.tobytes() for plan in self.plan)).hexdigest()
         return {**_geometry(self.robot), "paths": paths, "payload_kg": self.heaviest}
-
-
-def _stops(plan: Plan) -> Array:
-    """Postures at which the arm stops along a plan, float32 [stop, joint]; joint paths between them are straight."""
-    profiles = [distinct(phase.profile) for phase in plan.phases]
-    stops = np.concatenate([profile[(profile[:, 1] == 0).all(axis=1), 0] for profile in profiles])
-    return stops[np.append(True, (np.diff(stops, axis=0) != 0).any(axis=1))]
 
 
 def _geometry(robot: Robot) -> dict[str, object]:

@@ -12,7 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from fleet.arm.space import Sphere
+from fleet.arm.space import Sphere, path_of
 
 ANYWHERE = "*"
 """Space of an arm at an unknown position: its whole workspace."""
@@ -46,8 +46,8 @@ def no_conflicts(arm: str, space: str, other: str, other_space: str) -> bool:
 class CellSpace:
     """Which spaces of a cell exclude each other, as `Excludes`."""
 
-    volume: Mapping[str, int]
-    """Row of `conflicts` by name of the space."""
+    volumes: Mapping[str, tuple[int, float]]
+    """Row of `conflicts` and heaviest payload, kg, by path (`fleet.arm.space.path_of`)."""
     conflicts: np.ndarray
     """bool [volume, volume], symmetric."""
     workspaces: Mapping[str, Sphere]
@@ -60,12 +60,17 @@ class CellSpace:
 
         Spheres stand for whatever is not a plan of the cell. An arm at an unknown position excludes all.
         """
-        rows = self.volume.get(space), self.volume.get(other_space)
-        if None not in rows:
-            return bool(self.conflicts[rows])
+        row, other_row = self._row(space), self._row(other_space)
+        if row is not None and other_row is not None:
+            return bool(self.conflicts[row, other_row])
         one = sphere_of(space) or self.workspaces.get(arm)
         two = sphere_of(other_space) or self.workspaces.get(other)
         return one is None or two is None or one.gap_m(two) < self.clearance_m
+
+    def _row(self, space: str) -> int | None:
+        path, payload_kg = path_of(space)
+        row, heaviest_kg = self.volumes.get(path, (None, 0.0))
+        return row if payload_kg <= heaviest_kg else None
 
 
 def arms_in_the_way(

@@ -5,7 +5,7 @@ from typing import Any  # plain values of JSON
 
 from msgspec.structs import replace
 
-from fleet.arm.space import space_name, workspace
+from fleet.arm.space import workspace
 from fleet.bus.protocol.auction import MOST_JOBS
 from fleet.bus.protocol.cell import Cell, CellArm, CellFixture, CellKind, CellPlace, Limit, PlannedWork, Point
 from fleet.bus.protocol.messages import encode
@@ -32,7 +32,8 @@ JOB_FIELDS = ("payload_kg", "force_n", "dwell_s", "repetitions", "release_s", "d
 def cell_of(scenario: Scenario, participant: str, progress: Progress = quiet) -> tuple[Cell, CellSpace]:
     """The cell of a scenario as a participant describes it, and the space of all plans; plans and space are cached.
 
-    A plan for other work, which outsiders submitted, is not in the space: it excludes all plans of arms within reach.
+    A plan along another path or with a heavier payload, for a job that was submitted, is not in the space: it excludes
+    all plans of arms within reach.
     """
     from scenarios.prepare.arms import plan_arms
     from scenarios.prepare.fleet import space_of
@@ -56,9 +57,10 @@ def cell_of(scenario: Scenario, participant: str, progress: Progress = quiet) ->
     )
     if len(encode(cell)) > MAX_BYTES:
         cell = replace(cell, arms=tuple(replace(arm, works=()) for arm in cell.arms))
-    table = space_of(scenario, robots, [plan for arm in planned for plan in arm.all_plans], folder, progress)
+    plans = [plan for arm in planned for plan in arm.all_plans]
+    table = space_of(scenario, robots, plans, folder, progress)
     space = CellSpace(
-        volume={space_name(key): volume for key, volume in table.volume.items()},
+        volumes=table.by_path(plans),
         conflicts=table.conflicts,
         workspaces={robot.name: workspace(robot) for robot in robots},
         clearance_m=scenario.clearance_m,

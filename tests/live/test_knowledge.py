@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fleet.arm.space import Sphere, plan_key, space_name
+from fleet.arm.space import SpaceTable, Sphere, plan_key
 from fleet.bus.protocol.auction import Award, QuoteRequest, Submission
 from fleet.bus.protocol.consensus import Bid
 from fleet.bus.protocol.messages import State
@@ -30,6 +30,7 @@ from fleet.live.consensus.participant import QUIET_S, Membership, Participant
 from fleet.live.leases import Timing
 from fleet.live.records import SendAward
 from fleet.live.space import CellSpace
+from fleet.motion import Phase
 from fleet.observation import FIELDS, Observation
 from fleet.robot import JOINTS, ThermalLimits
 from scenarios.live.auctioneer import CentralAllocation, job_spec
@@ -97,10 +98,10 @@ class LiveShift:
     def __init__(self, env, arms, jobs, conflicts, allocate, fleet) -> None:
         self.time_s = self.real_s = 0.0
         world, (plans, table) = env.world, conflicts
-        volume = {space_name(plan_key(plan)): row for row, plan in enumerate(plans)}
+        volumes = SpaceTable({plan_key(plan): row for row, plan in enumerate(plans)}, table).by_path(plans)
         workspaces = dict.fromkeys(NAMES, Sphere(0.0, 0.0, 0.0, 1.5))
         self.jobs, self.fleet = tuple(map(job_spec, jobs)), fleet
-        self.excludes = CellSpace(volume=volume, conflicts=table, workspaces=workspaces, clearance_m=0.02)
+        self.excludes = CellSpace(volumes=volumes, conflicts=table, workspaces=workspaces, clearance_m=0.02)
         timing = Timing(lease_s=HOUR_S, pause_s=(0.1, 0.2))
         rules = {"allocate": allocate, "timing": timing, "excludes": self.excludes}
         ledger = JobBook(arms=NAMES)
@@ -229,7 +230,10 @@ def arms_of(small, works):
     arms = []
     for index in range(len(NAMES)):
         arm = small.arm(index, works, motors=quiet, model=Scores(), times=small.Times(cycle=10.0 + 2.0 * index))
-        plans = {work: (fast, slower(small, fast)) for work, (fast,) in arm.plans.items()}
+        plans = {
+            work: (along(fast, 0.01 * number), along(slower(small, fast), -0.01 * number))
+            for number, (work, (fast,)) in enumerate(arm.plans.items(), start=1)
+        }
         heavy = frozenset(work for work in works if index == len(NAMES) - 1 and work.payload_kg > TOO_HEAVY)
         allowed = {work: each for work, each in plans.items() if work not in heavy}
         arms.append(replace(arm, plans=allowed, too_heavy=heavy))
@@ -239,6 +243,13 @@ def arms_of(small, works):
 def slower(small, plan):
     tau = 0.7 * small.torque(plan.work.payload_kg)
     return replace(plan, speed=0.6, cycle=small.phase(1.5 * plan.cycle.duration_s, tau))
+
+
+def along(plan, q):
+    """Return the plan along a path of its own: random pairs of plans exclude each other."""
+    approach = plan.approach.profile.copy()
+    approach[:, 0] = q
+    return replace(plan, approach=Phase(approach, plan.approach.payload_kg))
 
 
 @pytest.mark.ci_slow

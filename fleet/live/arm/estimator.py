@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.arm.space import plan_key, space_name
+from fleet.arm.space import space_name
 from fleet.arm.time_limit import check_time, time_limit
 from fleet.bus.protocol.auction import NOT_PLANNED, JobEstimate, JobSpec, PlanQuote
 from fleet.difficulty import Difficulty, DifficultyModel
@@ -223,7 +223,7 @@ class Estimator:
     def space_of(self, job: JobSpec, plan: int) -> str | None:
         """Return the name of the space that the arm takes by a plan on offer; None if no such plan is prepared."""
         offers = self.plans(job)
-        return space_name(plan_key(offers[plan].plan)) if plan < len(offers) else None
+        return space_name(offers[plan].plan) if plan < len(offers) else None
 
     def estimate(
         self, jobs: Sequence[JobSpec], known_c: Array, busy_s: float, cycles: Mapping[str, int] = NO_CYCLES
@@ -339,5 +339,5 @@ def _quote(
         difficulty=None if score is None else score.total,
         duration_s=plan.duration_s(left),
         finish_in_s=finish_s if np.isfinite(finish_s) else None,
-        space=space_name(plan_key(plan)),
+        space=space_name(plan),
     )

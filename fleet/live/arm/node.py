@@ -17,7 +17,7 @@ from typing import Protocol, TypeVar
 import msgspec
 import numpy as np
 
-from fleet.arm.space import plan_key, space_name
+from fleet.arm.space import space_name
 from fleet.breaks import Break, break_at, break_in_s
 from fleet.bus.client import BusClient, Replies
 from fleet.bus.protocol import keys
@@ -506,13 +506,13 @@ class ArmNode:
     def space(self) -> tuple[str, ...]:
         """Name of the space that the arm takes; empty at home."""
         plan = self._body.away
-        return () if plan is None else (space_name(plan_key(plan)),)
+        return () if plan is None else (space_name(plan),)
 
     def space_of(self, job: JobSpec, plan: int) -> str | None:
         """Return the name of the space that the arm takes for a job by a plan; None if it has no such plan now."""
         for active in self.executor.active:
             if (active.award.job, active.award.plan) == (job, plan):
-                return space_name(plan_key(self._scored(active.award).plan))
+                return space_name(self._scored(active.award).plan)
         return self._estimator.space_of(job, plan)
 
     def _possible_space(self) -> tuple[str, ...]:
