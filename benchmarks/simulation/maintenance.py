@@ -176,7 +176,7 @@ class Maintenance:
         return self._is_noticed(name, 0) and not (name == AUCTIONEER and self._arm_forgets)
 
     def _epoch_is_known(self) -> bool:
-        return any(builder.epoch for name, builder in self._fleet.builders.items() if name in self._fleet.arms)
+        return all(builder.epoch for name, builder in self._fleet.builders.items() if name in self._fleet.arms)
 
     def _remedy(self, process: Process, right: dict[str, bytes]) -> None:
         """Restore the journals that a process refuses, or start it with `--new-epoch`.

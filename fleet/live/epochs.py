@@ -77,21 +77,19 @@ def check_journals(arm: str, number: int, epoch: str, histories: Iterable[Histor
     """Check that the journals of an arm are those that its peers know.
 
     Args:
-        number: As `first_number` returns it.
+        number: Least number of claims of the next start of the arm, by those in its journals.
         new_epoch: Whether a person has requested that the arm begins without the journals that its peers know.
 
     Raises:
         BusError: they are lost, older copies, or of another epoch: jobs might be done twice.
     """
     for peer in (history for history in histories if history.arm != arm):
-        claimed = peer.claims.get(arm, -1)
         if "" not in (epoch, peer.epoch) and epoch != peer.epoch:
             raise BusError(
                 f"The journals of '{arm}' are of the epoch '{epoch}', but {describe(peer)}. Jobs could be done twice. "
                 "Bring the right journals back, or put these aside and start the arm with --new-epoch."
             )
-        lost = claimed >= number or (claimed >= 0 and peer.epoch and not epoch)
-        if lost and not new_epoch:
+        if peer.claims.get(arm, -1) >= number and not new_epoch:
             raise BusError(
                 f"'{peer.arm}' knows claims of '{arm}' that its journals do not: they are lost, or older copies; "
                 f"{describe(peer)}. {REMEDY_OF_ARM}"

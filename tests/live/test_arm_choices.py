@@ -3,7 +3,6 @@
 import random
 import re
 from contextlib import nullcontext
-from copy import deepcopy
 from dataclasses import replace
 from functools import partial
 from itertools import islice
@@ -296,6 +295,29 @@ def test_a_last_cycle_is_not_begun_again_if_its_arm_lost_all_journals(fleet_of, 
     assert (fleet.begun, fleet.states("a")) == ({"a": 1}, {"unfinished"})
 
 
+@pytest.mark.parametrize("is_copy", [True, False])
+def test_an_arm_without_the_journals_that_its_peers_know_is_refused_at_every_start(fleet_of, is_copy):
+    """A refused start is counted in its journal, too; with a new epoch it needs no further request."""
+    fleet = fleet_of(True)
+    process = fleet.world.processes["arm_2"]
+    fleet.until(lambda: begun(fleet, *fleet.arms))
+    process.kill("is stopped")
+    copy = process.disk.copy() if is_copy else {}
+    process.start()
+    fleet.until(lambda: begun(fleet, *fleet.arms))
+    process.kill("is stopped")
+    process.disk.restore(copy)
+    for _ in range(3):
+        process.start()
+        fleet.run(3.0)
+        assert not process.up
+    for new_epoch in (True, False):
+        fleet.builders["arm_2"].new_epoch = new_epoch
+        process.kill("is stopped")
+        process.start()
+        fleet.until(lambda: begun(fleet, *fleet.arms))
+
+
 @pytest.mark.parametrize("witness_first", [True, False])
 def test_a_restored_copy_of_a_granter_from_before_its_last_start_is_noticed(fleet_of, witness_first):
     """By the peer that has forgotten all but the first claim of that start."""
@@ -306,7 +328,7 @@ def test_a_restored_copy_of_a_granter_from_before_its_last_start_is_noticed(flee
     *others, witness = fleet.arms
     for arm in others:
         processes[arm].kill("is stopped")
-    copies = {arm: deepcopy(processes[arm].disk.names) for arm in others}
+    copies = {arm: processes[arm].disk.copy() for arm in others}
     for arm in others:
         processes[arm].start()
     fleet.run(2.0)
@@ -316,8 +338,7 @@ def test_a_restored_copy_of_a_granter_from_before_its_last_start_is_noticed(flee
     (granter,) = {*others} - {holder}
     fleet.cut(holder)
     processes[granter].kill("is killed")
-    disk = processes[granter].disk
-    disk.names, disk._durable = copies[granter], dict(copies[granter])
+    processes[granter].disk.restore(copies[granter])
     fleet.run(8.0)
     for arm in (witness, granter) if witness_first else (granter, witness):
         processes[arm].start()
