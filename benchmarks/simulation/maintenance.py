@@ -1,18 +1,19 @@
 """What people do to the processes of a fleet, mistakes included, by a random stream of its own.
 
 An arm or the auctioneer is started with an older copy of its journals or without them, the auctioneer for other arms,
-and a second auctioneer beside the first; arms have breaks. Where the product refuses that, a person restores the
-journals or starts with `--new-epoch`.
+and a second auctioneer beside the first. Where the product refuses that, a person restores the journals or starts with
+`--new-epoch`. Arms have breaks, and the shift may end.
 
 Not simulated, as the documented limits (docs/bus/auctioneer.md) permit that jobs are done twice then:
 
 - lost journals, or a second auctioneer, while an arm is offline or the network is cut: so the other faults end before;
-- copies from before another journal was lost: nobody may know what was done in between;
+- copies from before another journal was lost or an arm left: nobody may know what was done in between;
 - without an auctioneer, a copy of which a peer knows no later start.
 """
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from random import Random
 from typing import Any, NamedTuple
 
@@ -38,6 +39,9 @@ QUIET_S = 40.0
 """Real seconds without other faults after journals are lost."""
 RETRY_S = 3.0
 """Real seconds between two requests to free the space of an arm that has left."""
+ENDED_S, BREAK_S = 40.0, 5.0
+"""Real seconds after which no arm departs: after the end of the shift (leases, retries), and after the begin of a break
+that ends the cycle."""
 
 
 class Copy(NamedTuple):
@@ -53,15 +57,17 @@ class Maintenance:
 
     Attributes:
         absent: Arms outside the roster.
+        ends_s: True second at which the shift ends, about; inf if it does not.
     """
 
     def __init__(self, fleet: Fleet, seed: int) -> None:
         self._fleet, self._world, self._rng = fleet, fleet.world, Random(f"maintenance {seed}")
         rng = self._rng
         self.absent: tuple[str, ...] = ()
+        self.ends_s = math.inf
         self._copies: dict[str, list[Copy]] = {}
         self._arm_forgets = False
-        """An arm has lost its journals: what it has done only the auctioneer may know."""
+        """An arm has left or lost its journals: what it has done only the auctioneer may know."""
         tasks = [self._lose_journals] if fleet.alone else [self._lose_journals, self._start_second, self._change_roster]
         self._tasks = [task for task in tasks if rng.random() < 0.6] or tasks
         self._gap_s = rng.choice([60.0, 120.0, 240.0])
@@ -70,8 +76,11 @@ class Maintenance:
             fleet.build_auctioneer()
 
     def plan(self, until_s: float) -> None:
-        """Plan breaks of the arms, and what is done up to a true time."""
+        """Plan breaks of the arms, the end of the shift, and what is done up to a true time."""
         rng, speed = self._rng, self._fleet.speed
+        if rng.random() < 0.25:
+            self.ends_s = rng.uniform(0.3, 1.0) * until_s
+            self._plan_end()
         for builder in self._fleet.builders.values() if rng.random() < 0.5 else ():
             begins_s = [rng.uniform(0.0, until_s) * speed for _ in range(rng.randint(1, 3))]
             builder.breaks = tuple(
@@ -87,6 +96,42 @@ class Maintenance:
         while at_s < until_s:
             self._world.at(at_s, self._begin)
             at_s += rng.expovariate(1.0 / self._gap_s)
+
+    def _plan_end(self) -> None:
+        fleet = self._fleet
+        if not fleet.alone:
+            self._world.at(self.ends_s, self._end_shift)
+        for builder in fleet.builders.values() if fleet.alone else ():
+            assert builder.membership is not None
+            builder.membership = replace(builder.membership, horizon_s=self.ends_s * fleet.speed)
+
+    def _end_shift(self) -> None:
+        """Have the process of the auctioneer end the shift, also again after a restart."""
+        process = self._world.processes[AUCTIONEER]
+        node: Any = process.node
+        if node is not None and not process.paused and not node.book.ended:
+            process._call(node.end)
+        self._world.after(1.0, self._end_shift)
+
+    @property
+    def ends(self) -> bool:
+        """Whether the shift ends."""
+        return self.ends_s < math.inf
+
+    def check_departure(self, arm: str) -> None:
+        """Check that an arm may leave home at this time.
+
+        Raises:
+            Violation: it has a break, or the shift is over.
+        """
+        fleet, builder, node = self._fleet, self._fleet.builders[arm], self._fleet.node(arm)
+        if builder.machine is None or any(active.may_commit for active in node.executor.active):
+            return
+        if self._world.now_s > self.ends_s + ENDED_S:
+            raise Violation(f"'{arm}' leaves home after the end of the shift.")
+        time_s, late_s = builder.machine.time_s, BREAK_S * fleet.speed
+        if any(each.finish == "cycle" and each.begin_s + late_s < time_s < each.end_s for each in builder.breaks):
+            raise Violation(f"'{arm}' leaves home in a break.")
 
     def keep_copy(self, process: Process) -> None:
         """Copy the journals of an exited process, unless others have just lost theirs."""
@@ -133,12 +178,31 @@ class Maintenance:
     # Journals
 
     def _lose_journals(self) -> None:
-        self._when_online(self._swap)
+        if self._fleet.alone or self._rng.random() < 0.5:
+            self._when_online(self._swap)
+        else:
+            self._swap_of_arm()
+
+    def _swap_of_arm(self) -> None:
+        """Have an arm start with an older copy of its journal or without it, beside an auctioneer and other faults."""
+        name = self._rng.choice(self._fleet.arms)
+        process = self._world.processes[name]
+        if process.node is not None:
+            files = self._rng.choice([{}, *(copy.files for copy in self._copies.get(name, []))])
+            self._log(f"starts '{name}' with {'an older copy of' if files else 'deleted'} journals")
+            self._forget(name)
+            process.kill("is stopped")
+            process.disk.restore(files)
+
+    def _forget(self, name: str) -> None:
+        self._fleet.forget(name)
+        self._copies.clear()
+        self._arm_forgets |= name in self._fleet.arms
 
     def _swap(self) -> None:
         """Have a process, and maybe others, start with an older copy of its journals or without them."""
         fleet, rng = self._fleet, self._rng
-        name = rng.choice([AUCTIONEER, FIRST, *fleet.arms] if not fleet.alone else fleet.arms)
+        name = AUCTIONEER if not fleet.alone else rng.choice(fleet.arms)
         process = self._world.processes[name]
         choices = [copy.files for copy in self._copies.get(name, []) if self._is_noticed(name, copy.first_number)]
         choices += [{}] if self._may_delete(name) else []
@@ -146,15 +210,13 @@ class Maintenance:
             fleet.quiet_until_s = self._world.now_s
             return
         files = rng.choice(choices)
-        needs_remedy = fleet.alone or (name == AUCTIONEER and not files and self._epoch_is_known())
+        needs_remedy = fleet.alone or (name == AUCTIONEER and not files and any(self._epochs()))
         if fleet.alone and not files and rng.random() < 0.5:
             part = rng.choice(["awards", "grants"])
             files = {file: content for file, content in process.disk.copy().items() if not file.startswith(part)}
             needs_remedy = part == "grants"  # the grants of the arm name its claims
         self._log(f"starts '{name}' with {'an older copy of' if files else 'deleted'} journals: {sorted(files)}")
-        fleet.forget(name)
-        self._copies.clear()
-        self._arm_forgets |= name != AUCTIONEER
+        self._forget(name)
         process.kill("is stopped")
         right = process.disk.copy()
         process.disk.restore(files)
@@ -175,8 +237,8 @@ class Maintenance:
     def _may_delete(self, name: str) -> bool:
         return self._is_noticed(name, 0) and not (name == AUCTIONEER and self._arm_forgets)
 
-    def _epoch_is_known(self) -> bool:
-        return all(builder.epoch for name, builder in self._fleet.builders.items() if name in self._fleet.arms)
+    def _epochs(self) -> list[str]:
+        return [builder.epoch for name, builder in self._fleet.builders.items() if name in self._fleet.arms]
 
     def _remedy(self, process: Process, right: dict[str, bytes]) -> None:
         """Restore the journals that a process refuses, or start it with `--new-epoch`.
@@ -206,17 +268,21 @@ class Maintenance:
         self._when_online(self._run_second)
 
     def _run_second(self) -> None:
-        """Start another auctioneer for some time, with or without a copy of the journal, and maybe restart the first."""
+        """Start another auctioneer for some time, maybe with a copy of the journal, and maybe restart the first."""
         fleet, rng, world = self._fleet, self._rng, self._world
+        if not all(self._epochs()):  # the first one would have to be stopped if the second was the first to award
+            fleet.quiet_until_s = world.now_s
+            return
         copies = self._copies.get(AUCTIONEER, [])
-        name, files = rng.choice([(AUCTIONEER, {}), ("auctioneer_2", {}), *((AUCTIONEER, each.files) for each in copies)])
+        name, files = rng.choice(
+            [(AUCTIONEER, {}), ("auctioneer_2", {}), *((AUCTIONEER, each.files) for each in copies)]
+        )
         second = world.processes.get(SECOND) or Process(world, SECOND, lambda _: None)  # type: ignore[arg-type]
         second._build = fleet.auctioneer_builder(name=name)
         second.disk.restore(files)
         self._log(f"starts a second auctioneer '{name}' with {sorted(files)}")
-        fleet.forget(AUCTIONEER)
-        fleet.forget(name)
-        self._copies.clear()
+        self._forget(AUCTIONEER)
+        self._forget(name)
         if rng.random() < 0.6:
             world.after(rng.uniform(0.0, 3.0), world.processes[AUCTIONEER].kill, "is killed meanwhile")
         world.after(rng.uniform(0.0, 3.0), second.start)
@@ -247,6 +313,8 @@ class Maintenance:
             arm = rng.choice(leaving)
             self._log(f"removes '{arm}' for good")
             fleet.doubt(arm)
+            self._copies.clear()
+            self._arm_forgets = True
             fleet.retire(self._world.processes[arm])
             self._set_roster(tuple(each for each in fleet.arms if each != arm))
             self._free_space(arm)

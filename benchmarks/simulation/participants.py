@@ -65,7 +65,7 @@ class ArmProcess:
         self, deeds: Deeds, first: str, speed: float, rate_hz: float, capacity: int, membership: Membership | None
     ) -> None:
         self._deeds, self._first, self._speed, self._rate_hz = deeds, first, speed, rate_hz
-        self._capacity, self._membership = capacity, membership
+        self._capacity, self.membership = capacity, membership
         self.machine: SimulatedArm | None = None
         self.unsure: set[str] = set()
         self.new_epoch = False
@@ -97,9 +97,9 @@ class ArmProcess:
         body: Any = self.machine
         estimator: Any = SimulatedEstimator(name, self._first)
         settings = ArmConfig(warning_c=80.0, rate_hz=self._rate_hz, boot=history.boot, breaks=self.breaks)
-        if self._membership is None:
+        if self.membership is None:
             return ArmNode(link, body, executor, estimator, clock, settings, partial(AuctioneerClient, history=kept))
-        grants, membership = _journal(process, "grants", BookRecord), self._membership
+        grants, membership = _journal(process, "grants", BookRecord), self.membership
 
         def join(arm: ArmNode) -> ConsensusNode:
             node = ConsensusNode(arm, membership, grants, boot=history.boot, new_epoch=self.new_epoch)

@@ -110,6 +110,12 @@ class Shift(Fleet):
             self._check_space()
             self._end_recording()
 
+    def departs(self, arm: str, space: str) -> None:
+        """Check as a fleet does, and that the arm may leave home now."""
+        super().departs(arm, space)
+        if self.maintenance is not None:
+            self.maintenance.check_departure(arm)
+
     def begins_last_cycle(self, arm: str, job: str) -> None:
         """Check as a fleet does. The arm breaks down if a person has asked to redo the job.
 
@@ -292,7 +298,8 @@ class Shift(Fleet):
                 raise Violation(f"'{name}' is called finished, and was done {done} times.")
             if done and state != "finished" and name not in self.unsure:
                 raise Violation(f"'{name}' was done, and is called {state}.")
-            if state == "unfinished" and name not in self.unsure | self.doubtful and not self._lacks_permission(name):
+            unsure = name in self.unsure | self.doubtful or (self.maintenance is not None and self.maintenance.ends)
+            if state == "unfinished" and not unsure and not self._lacks_permission(name):
                 raise Violation(f"'{name}' is unfinished, and no arm stopped in its last cycle.")
             if state == "cancelled" and name not in self.cancelled:
                 raise Violation(f"'{name}' is cancelled, and nobody asked for it.")

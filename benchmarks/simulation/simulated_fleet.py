@@ -117,9 +117,7 @@ class Fleet:
         self.builders = {name: ArmProcess(self, FIRST, speed, rate_hz, capacity, membership) for name in arms}
         for name in arms:
             Process(world, name, self.builders[name])
-        self._auctioneer = partial(
-            auctioneer_process, speed=speed, allocate=allocate, timing=timing, excludes=excludes
-        )
+        self._auctioneer = partial(auctioneer_process, speed=speed, allocate=allocate, timing=timing, excludes=excludes)
         if not alone:
             Process(world, AUCTIONEER, self.auctioneer_builder())
         self.sent = Sent(world.bus)
@@ -181,9 +179,10 @@ class Fleet:
         """Note that a participant is about to lose what its journals have."""
         nodes = {arm: node for arm in self.arms if (node := self.node(arm)) is not None}
         self._excused |= {(name, each.award.award) for node in nodes.values() for each in node.executor.active}
-        books = [node.work_source.book for node in nodes.values()] if self.alone else [self.node(AUCTIONEER).book]
-        for book in books:
-            self.doubtful |= {job for job, entry in book.jobs.items() if any(g.may_commit for g in entry.grants.values())}
+        central = None if self.alone else self.node(AUCTIONEER)
+        for source in [node.work_source for node in nodes.values()] if self.alone else [central] if central else []:
+            jobs = source.book.jobs.items()
+            self.doubtful |= {job for job, entry in jobs if any(grant.may_commit for grant in entry.grants.values())}
         self.sent.renumber(name)
         if name in self.builders:
             self.doubt(name)
