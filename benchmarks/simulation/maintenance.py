@@ -336,4 +336,5 @@ class Maintenance:
         if self._world.processes[arm].up:
             self._world.after(RETRY_S, self._free_space, arm)
         else:
+            self._fleet.is_home(arm)
             link.query(keys.of_jobs("f", "clear"), ClearRequest(arm, "a person"), Cleared, done, timeout_s=2.0)

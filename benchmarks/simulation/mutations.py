@@ -15,12 +15,16 @@ from fleet.bus.protocol.operator import Cancel, Change, Operation, Pause, Resume
 from fleet.errors import Refused
 from fleet.live import steering as steering_module
 from fleet.live.arm.awards import ArmHistory, AwardAccepted, AwardExecutor, Closed
+from fleet.live.arm.node import ArmNode
 from fleet.live.auction import auctioneer as auctioneer_module
+from fleet.live.auction import node as auction_node_module
 from fleet.live.auction import rounds as round_module
 from fleet.live.auction.auctioneer import Auctioneer
+from fleet.live.auction.node import AuctionNode, EpochCheck
 from fleet.live.auction.rounds import Rounds
 from fleet.live.book import JobBook
 from fleet.live.consensus import grants as grants_module
+from fleet.live.consensus import node as consensus_node_module
 from fleet.live.consensus import participant as participant_module
 from fleet.live.consensus.grants import Claimant, Granter
 from fleet.live.consensus.participant import Participant
@@ -415,4 +419,61 @@ add_mutation(
     "repeats-recorded",
     "a message is recorded once",
     (Recorder, "_fill", lambda _: lambda self, series, count, time_s: True),
+)
+
+
+def _nothing(_: Any) -> Any:
+    return lambda *_, **__: None
+
+
+def _endless(ready: Any) -> Any:
+    """Offer jobs after the end of the shift."""
+
+    def patched(self: Any, *arguments: Any, **more: Any) -> Any:
+        ended, self.ended = self.ended, False
+        try:
+            return ready(self, *arguments, **more)
+        finally:
+            self.ended = ended
+
+    return patched
+
+
+add_mutation(
+    "journals-unchecked",
+    "an arm takes part with the journals that its peers know",
+    (consensus_node_module, "check_journals", _nothing),
+    alone=True,
+)
+add_mutation(
+    "empty-journal",
+    "an auctioneer without a journal does not start beside arms that know one",
+    (auction_node_module, "check_begin", _nothing),
+    alone=False,
+)
+add_mutation(
+    "history-ignored",
+    "an auctioneer adopts what arms have done and have",
+    (auctioneer_module, "adopted", lambda _: lambda book, history: []),
+    alone=False,
+)
+add_mutation(
+    "history-not-awaited",
+    "after a restart no job is awarded before the arms reply",
+    (EpochCheck, "awaited", lambda _: lambda self, arms: frozenset()),
+    alone=False,
+)
+add_mutation(
+    "two-auctioneers",
+    "a second auctioneer is refused, or both award nothing",
+    (AuctionNode, "_check_no_auctioneer", _nothing),
+    (AuctionNode, "_set_rival", _nothing),
+    alone=False,
+)
+add_mutation("break-ignored", "an arm takes no job in a break", (ArmNode, "_keep_breaks", _nothing))
+add_mutation(
+    "end-ignored",
+    "no job is awarded after the end of the shift",
+    (JobBook, "ready", _endless),
+    alone=False,
 )

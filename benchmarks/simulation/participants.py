@@ -103,7 +103,7 @@ class ArmProcess:
 
         def join(arm: ArmNode) -> ConsensusNode:
             node = ConsensusNode(arm, membership, grants, boot=history.boot, new_epoch=self.new_epoch)
-            self.first_number = node._first_number
+            self.first_number = node.participant._number
             return node
 
         return ArmNode(link, body, executor, estimator, clock, settings, join)
