@@ -19,13 +19,22 @@ from statistics import median_high
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import MOST_JOBS, Award, JobSpec, JobState
+from fleet.bus.protocol.auction import ABANDONED, MOST_JOBS, Award, JobSpec, JobState
 from fleet.bus.protocol.consensus import History, HistoryRequest, JobOutcome, with_finished
 from fleet.errors import BusError
 from fleet.live.book import JobBook
 from fleet.live.job_rules import is_same_work
 from fleet.live.journal import CommitPermitted, EpochBegun, JobsAccepted
-from fleet.live.records import BookRecord, ClaimNumbered, Granted, HistoryAdopted, JobEntry, JobSettled
+from fleet.live.records import (
+    FINISHED_BY,
+    NO_AWARD,
+    BookRecord,
+    ClaimNumbered,
+    Granted,
+    HistoryAdopted,
+    JobEntry,
+    JobSettled,
+)
 
 REPLY_S = 1.0
 """Real seconds that an arm has to reply."""
@@ -151,16 +160,25 @@ def _is_unknown(book: JobBook, job: JobSpec) -> bool:
 
 
 def _finished_last_cycles(book: JobBook, history: History) -> Iterator[BookRecord]:
-    """Yield the end of jobs that the arm had permission to commit: an older copy lacks its report."""
+    """Yield the end of jobs that the arm had permission to commit, or that are abandoned: an older copy lacks it."""
     held = {award.award for award in history.awards}
     for job in history.finished:
-        entry = book.jobs.get(job.name)
-        grant = None if entry is None or not _is_open(book, job, "finishing", "unfinished") else entry.grant
-        if grant is None or not grant.may_commit or grant.record.arm != history.arm or grant.record.award in held:
-            continue
-        reason = f"'{history.arm}' had finished it; the journal did not know it."
-        terms = (grant.record.award, history.arm, "finished", job.repetitions, book.time_s, reason)
-        yield JobSettled(JobOutcome(job.name, *terms))
+        entry, award = book.jobs.get(job.name), NO_AWARD
+        if not _is_abandoned(book, job):
+            grant = None if entry is None or not _is_open(book, job, "finishing", "unfinished") else entry.grant
+            if grant is None or not grant.may_commit or grant.record.arm != history.arm:
+                continue
+            award = grant.record.award
+        if award not in held:
+            terms = (award, history.arm, "finished", job.repetitions, book.time_s, FINISHED_BY.format(history.arm))
+            yield JobSettled(JobOutcome(job.name, *terms))
+
+
+def _is_abandoned(book: JobBook, job: JobSpec) -> bool:
+    """Return whether a job is abandoned here, such as one that was late before its arm replied."""
+    if job.name in book.jobs:
+        return _is_open(book, job, *ABANDONED)
+    return book.past.is_given_up(job.name) and book.past.is_same(job)
 
 
 def _of_award(book: JobBook, history: History, award: Award) -> Iterator[BookRecord]:
