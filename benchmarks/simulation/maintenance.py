@@ -225,7 +225,7 @@ class Maintenance:
                 self._world.processes[other].kill("is restarted too")
         self._be_quiet(QUIET_S)
         if needs_remedy:
-            self._world.after(REFUSED_S, self._remedy, process, right)
+            self._world.after(rng.choice([0.0, REFUSED_S, REFUSED_S]), self._remedy, process, right)
 
     def _is_noticed(self, name: str, first_number: int) -> bool:
         """Whether all peers know a later start of an arm without an auctioneer."""

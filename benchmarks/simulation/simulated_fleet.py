@@ -270,7 +270,9 @@ class Fleet:
         for granter, end_s in ends_s.items():
             node = self.node(granter) if holder.real_s < end_s else None
             book = None if node is None else (node.work_source if self.alone else node).book
-            if book is not None and name not in book.open and (granter, name) not in self._excused:
+            if book is None or name in book.open:
+                continue
+            if (granter, name) not in self._excused or (self.alone and node.work_source._joined):
                 raise Violation(f"'{granter}' has no grant of '{name}', which '{holder.name}' still leases.")
 
     def _check_known(self) -> None:

@@ -22,6 +22,7 @@ from fleet.bus.protocol.keys import of_arm
 from fleet.bus.protocol.operator import Settle
 from fleet.errors import BusError
 from fleet.live.consensus.node import ConsensusNode
+from fleet.live.space import ANYWHERE
 from scenarios.live.arm import refuse_auctioneer
 from tests.live.simulated import LONG, SPEED, SimulatedFleet, job, refused
 from tests.profiles import examples
@@ -315,7 +316,35 @@ def test_an_arm_without_the_journals_that_its_peers_know_is_refused_at_every_sta
         fleet.builders["arm_2"].new_epoch = new_epoch
         process.kill("is stopped")
         process.start()
-        fleet.until(lambda: begun(fleet, *fleet.arms))
+        fleet.until(lambda: process.node.work_source._joined)
+
+
+@pytest.mark.parametrize("is_copy", [True, False])
+@pytest.mark.parametrize("repeats", [True, False])
+def test_a_new_epoch_begins_with_unknown_positions_until_each_peer_repeats_its_claim(fleet_of, is_copy, repeats):
+    """All peers were at home when the journals were copied, and one has left since."""
+    fleet = fleet_of(True)
+    process = fleet.world.processes["arm_2"]
+    fleet.until(lambda: begun(fleet, *fleet.arms))
+    process.kill("is stopped")
+    copy = process.disk.copy() if is_copy else {}
+    fleet.submit(job("a", 400))
+    fleet.until(lambda: bool(fleet.away))
+    process.start()
+    fleet.until(lambda: begun(fleet, *fleet.arms))
+    fleet.forget("arm_2")
+    process.kill("is stopped")
+    process.disk.restore(copy)
+    if not repeats:
+        fleet.lose("claim")
+    fleet.builders["arm_2"].new_epoch = True
+    process.start()
+    fleet.until(lambda: process.node.work_source._joined)
+    fleet.run(3.0)
+    spaces = fleet.node("arm_2").work_source.book.taken_space()
+    away = {frozenset([space]) for space in fleet.away.values()}
+    expected = {frozenset(), *away} if repeats else {frozenset([ANYWHERE])}
+    assert {spaces[arm] for arm in ("arm_0", "arm_1")} == expected
 
 
 @pytest.mark.parametrize("witness_first", [True, False])

@@ -29,9 +29,10 @@ from fleet.live.consensus.participant import TOO_FEW, Membership, Participant
 from fleet.live.desk import JobDesk
 from fleet.live.epochs import REPLY_S, adopted, ask_arms, check_journals, history_of
 from fleet.live.job_rules import SHIFT_ENDED
-from fleet.live.journal import EpochBegun, Journal, Started, TimeRecorder, own_records
+from fleet.live.journal import EpochBegun, Journal, SpaceTaken, Started, TimeRecorder, own_records
 from fleet.live.rate_limit import RateLimitedWarnings
 from fleet.live.records import BookRecord, ClaimNumbered, JobEntry
+from fleet.live.space import ANYWHERE
 
 _LOG = logging.getLogger(__name__)
 
@@ -101,7 +102,7 @@ class ConsensusNode(JobDesk):
         self._tokens: set[str] = set()
         self._begun = self._busy = False
         self._ended_s = math.inf
-        self._since_s = real_s
+        self._started_s = self._since_s = real_s
         """Real second since which a majority has been present."""
         self.wake_s = math.inf
         arm.set_clock(FleetClock(self._speed, real_s + NOT_YET_S))
@@ -172,10 +173,14 @@ class ConsensusNode(JobDesk):
             return
         known = max((history.claims.get(self._name, -1) for history in histories), default=-1)
         if known >= number:
+            # It may have granted leases of which it does not know.
+            if time.monotonic() < self._started_s + granter.timing.counted_lease_s:
+                return
             _LOG.warning("Arm '%s' adopts what %d arm(s) have done and have.", self._name, len(histories))
             for history in (each for each in histories if each.arm != self._name):
                 granter.adopt(adopted(self.book, history), time.monotonic())
-            self.book.record(ClaimNumbered(self._name, known))
+            peers = sorted(granter.roster - {self._name})  # each repeats its claim for this arm
+            self.book.record(*(SpaceTaken(arm, (ANYWHERE,)) for arm in peers), ClaimNumbered(self._name, known))
             self.participant.count_after(known)
         self._take_epoch(next((history.epoch for history in histories if history.epoch), ""))
         self._joined = True
