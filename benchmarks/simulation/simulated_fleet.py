@@ -269,10 +269,10 @@ class Fleet:
             ends_s = {arm: asked_s + active.lease_s for arm, asked_s in vote.granted_s.items()} if vote else {}
         for granter, end_s in ends_s.items():
             node = self.node(granter) if holder.real_s < end_s else None
-            book = None if node is None else (node.work_source if self.alone else node).book
-            if book is None or name in book.open:
+            source = node.work_source if self.alone and node is not None else node
+            if source is None or name in source.book.open:
                 continue
-            if (granter, name) not in self._excused or (self.alone and node.work_source._joined):
+            if (granter, name) not in self._excused or (self.alone and source._joined):
                 raise Violation(f"'{granter}' has no grant of '{name}', which '{holder.name}' still leases.")
 
     def _check_known(self) -> None:
