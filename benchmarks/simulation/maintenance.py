@@ -64,7 +64,7 @@ class Maintenance:
         self._fleet, self._world, self._rng = fleet, fleet.world, Random(f"maintenance {seed}")
         rng = self._rng
         self.absent: tuple[str, ...] = ()
-        self.ends_s = math.inf
+        self.ends_s = self._ended_s = math.inf
         self._copies: dict[str, list[Copy]] = {}
         self._arm_forgets = False
         """An arm has left or lost its journals: what it has done only the auctioneer may know."""
@@ -110,6 +110,7 @@ class Maintenance:
         process = self._world.processes[AUCTIONEER]
         node: Any = process.node
         if node is not None and not process.paused and not node.book.ended:
+            self._ended_s = min(self._ended_s, self._world.now_s)
             process._call(node.end)
         self._world.after(1.0, self._end_shift)
 
@@ -127,9 +128,10 @@ class Maintenance:
         fleet, builder, node = self._fleet, self._fleet.builders[arm], self._fleet.node(arm)
         if builder.machine is None or any(active.may_commit for active in node.executor.active):
             return
-        if self._world.now_s > self.ends_s + ENDED_S:
-            raise Violation(f"'{arm}' leaves home after the end of the shift.")
         time_s, late_s = builder.machine.time_s, BREAK_S * fleet.speed
+        ended_s = time_s / fleet.speed - self.ends_s if fleet.alone else self._world.now_s - self._ended_s
+        if ended_s > ENDED_S:
+            raise Violation(f"'{arm}' leaves home after the end of the shift.")
         if any(each.finish == "cycle" and each.begin_s + late_s < time_s < each.end_s for each in builder.breaks):
             raise Violation(f"'{arm}' leaves home in a break.")
 
@@ -197,6 +199,7 @@ class Maintenance:
     def _forget(self, name: str) -> None:
         self._fleet.forget(name)
         self._copies.clear()
+        self._ended_s = math.inf
         self._arm_forgets |= name in self._fleet.arms
 
     def _swap(self) -> None:

@@ -27,6 +27,7 @@ from fleet.live.consensus import grants as grants_module
 from fleet.live.consensus import node as consensus_node_module
 from fleet.live.consensus import participant as participant_module
 from fleet.live.consensus.grants import Claimant, Granter
+from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Participant
 from fleet.live.job_rules import PastJobs, content_hash
 from fleet.live.journal import CommitPermitted, JobsAccepted, Journal, Released
@@ -426,19 +427,6 @@ def _nothing(_: Any) -> Any:
     return lambda *_, **__: None
 
 
-def _endless(ready: Any) -> Any:
-    """Offer jobs after the end of the shift."""
-
-    def patched(self: Any, *arguments: Any, **more: Any) -> Any:
-        ended, self.ended = self.ended, False
-        try:
-            return ready(self, *arguments, **more)
-        finally:
-            self.ended = ended
-
-    return patched
-
-
 add_mutation(
     "journals-unchecked",
     "an arm takes part with the journals that its peers know",
@@ -472,8 +460,8 @@ add_mutation(
 )
 add_mutation("break-ignored", "an arm takes no job in a break", (ArmNode, "_keep_breaks", _nothing))
 add_mutation(
-    "end-ignored",
-    "no job is awarded after the end of the shift",
-    (JobBook, "ready", _endless),
-    alone=False,
+    "no-end",
+    "no job is begun after the end of the shift",
+    (AuctionNode, "end", _nothing),
+    (ConsensusNode, "_end", _nothing),
 )
