@@ -9,9 +9,10 @@ what they have finished, what they have, and what they may have done: such a job
 The auctioneer waits for at most 20 s: what only an arm knows that comes online later may be done again.
 
 Without an auctioneer all arms keep one epoch. An arm whose journals are lost has forgotten what it granted and what was
-done: it does not take part beside arms that know it, unless a person requests it (`--new-epoch`). Then it adopts what
-the present arms have done and have. An arm takes part only after a majority, with itself, has replied with its history.
-Peers record the first claim of each start: an older copy is noticed only if a replying peer knows a later start.
+done: it does not take part beside arms that know it, unless a person requests it (`--new-epoch`). Then it waits for
+the length of a lease, adopts what the present arms have done and have, and takes them to be anywhere until they repeat
+their claims. An arm takes part only after a majority, with itself, has replied with its history. All record the first
+claim of each start: an older copy is noticed only if a replying peer knows a later start.
 """
 
 from collections.abc import Iterable, Iterator
