@@ -443,13 +443,13 @@ def test_an_arm_does_not_start_with_journals_of_a_fleet_of_other_arms(fleet_of, 
     fleet.submit(*(job(f"job {number}", 2, value=1.0) for number in range(20 if compacted else 1)))
     fleet.until(lambda: fleet.is_everywhere("job 0", "finished"))
     builder, process = fleet.builders["arm_0"], fleet.world.processes["arm_0"]
-    three = builder._membership
-    builder._membership = replace(three, fleet=replace(three.fleet, arms=(*fleet.arms, "arm_3", "arm_4")))
+    three = builder.membership
+    builder.membership = replace(three, fleet=replace(three.fleet, arms=(*fleet.arms, "arm_3", "arm_4")))
     fleet.restart("arm_0")
     assert not process.up
     (line,) = fleet.logged("exits")
     assert "are of a fleet of the arms arm_0, arm_1, arm_2, not of arm_0, arm_1, arm_2, arm_3, arm_4" in line
-    builder._membership = three
+    builder.membership = three
     process.start()
     fleet.until(lambda: begun(fleet, "arm_0"))
 
