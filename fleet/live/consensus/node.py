@@ -31,7 +31,7 @@ from fleet.live.epochs import REPLY_S, adopted, ask_arms, check_journals, histor
 from fleet.live.job_rules import SHIFT_ENDED
 from fleet.live.journal import EpochBegun, Journal, SpaceTaken, Started, TimeRecorder, own_records
 from fleet.live.rate_limit import RateLimitedWarnings
-from fleet.live.records import BookRecord, ClaimNumbered, JobEntry
+from fleet.live.records import BookRecord, JobEntry
 from fleet.live.space import ANYWHERE
 
 _LOG = logging.getLogger(__name__)
@@ -180,7 +180,7 @@ class ConsensusNode(JobDesk):
             for history in (each for each in histories if each.arm != self._name):
                 granter.adopt(adopted(self.book, history), time.monotonic())
             peers = sorted(granter.roster - {self._name})  # each repeats its claim for this arm
-            self.book.record(*(SpaceTaken(arm, (ANYWHERE,)) for arm in peers), ClaimNumbered(self._name, known))
+            self.book.record(*(SpaceTaken(arm, (ANYWHERE,)) for arm in peers))
             self.participant.count_after(known)
         self._take_epoch(next((history.epoch for history in histories if history.epoch), ""))
         self._joined = True
