@@ -290,8 +290,12 @@ class Maintenance:
             world.after(rng.uniform(0.0, 3.0), world.processes[AUCTIONEER].kill, "is killed meanwhile")
         world.after(rng.uniform(0.0, 3.0), second.start)
         ends_s = rng.uniform(4.0, 20.0)
-        world.after(ends_s, second.kill, "is stopped")
+        world.after(ends_s, self._stop_second, second)
         self._be_quiet(ends_s + QUIET_S)
+
+    def _stop_second(self, second: Process) -> None:
+        self._forget(AUCTIONEER)  # which may have been replaced for some time
+        second.kill("is stopped")
 
     # The roster
 
