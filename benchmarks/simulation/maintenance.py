@@ -8,7 +8,7 @@ Not simulated, as the documented limits (docs/bus/auctioneer.md) permit that job
 
 - lost journals, or a second auctioneer, while an arm is offline or the network is cut: so the other faults end before;
 - copies from before another journal was lost or an arm left: nobody may know what was done in between;
-- without an auctioneer, a copy of which a peer knows no later start.
+- without an auctioneer, a copy of which a peer knows no later start, and what is left of jobs that have left the books.
 """
 
 import math

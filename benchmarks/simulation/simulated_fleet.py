@@ -181,8 +181,10 @@ class Fleet:
         self._excused |= {(name, each.award.award) for node in nodes.values() for each in node.executor.active}
         central = None if self.alone else self.node(AUCTIONEER)
         for source in [node.work_source for node in nodes.values()] if self.alone else [central] if central else []:
-            jobs = source.book.jobs.items()
+            jobs, accepted = source.book.jobs.items(), self.submitter.accepted
             self.doubtful |= {job for job, entry in jobs if any(grant.may_commit for grant in entry.grants.values())}
+            for job in [job for job in accepted if self.alone and job in source.book.past]:
+                del accepted[job]  # a history lacks jobs that have left the book
         self.sent.renumber(name)
         if name in self.builders:
             self.doubt(name)
