@@ -250,7 +250,7 @@ class Maintenance:
             Violation: it has not refused them.
         """
         fleet, name = self._fleet, process.name
-        if process.node is not None and self._is_online(name):
+        if self._is_online(name) and not (name == AUCTIONEER and fleet.node(name)._epochs.objection):
             raise Violation(f"'{name}' takes part without the journals that others know.")
         process.kill("is stopped")
         if self._rng.random() < 0.3:
@@ -259,6 +259,7 @@ class Maintenance:
             return
         self._log(f"starts '{name}' with --new-epoch")
         if name == AUCTIONEER:
+            process.disk.restore({})
             fleet.build_auctioneer(new_epoch=True)
             self._world.after(QUIET_S / 2, fleet.build_auctioneer)
         else:

@@ -42,8 +42,8 @@ REPLY_S = 1.0
 MAX_NAMED = 5
 """Jobs that an error names."""
 REMEDY = (
-    "Stop the auctioneer and bring the journal back, or start with --new-epoch: then jobs that the arms have done are "
-    "not done again, and all other jobs of the old journal must be submitted again."
+    "Stop the auctioneer and bring the journal back, or {}start with --new-epoch: then jobs that the arms have done "
+    "are not done again, and all other jobs must be submitted again."
 )
 
 
@@ -67,7 +67,9 @@ def check_begin(fleet: str, histories: Iterable[History]) -> None:
     """
     for history in histories:
         if history.epoch:
-            raise BusError(f"The journal is empty, but fleet '{fleet}' has worked: {describe(history)}. {REMEDY}")
+            raise BusError(
+                f"The journal is empty, but fleet '{fleet}' has worked: {describe(history)}. {REMEDY.format('')}"
+            )
 
 
 def describe(history: History) -> str:

@@ -279,9 +279,12 @@ def test_jobs_are_refused_when_arms_of_an_older_epoch_come_later(one):
     one.until(lambda: boss(one)._epochs.objection)
     reason = refused(lambda: one.submit(job("a", 2)))
     assert "the journal has the epoch" in reason
-    assert "--new-epoch" in reason
     assert reason.endswith("Or stop 'arm_0', if it alone is wrong.")
     assert within(one, lambda: boss(one)._epochs.admitted(["arm_0"])) == frozenset()
+    assert "put this one aside and start with --new-epoch" in reason
+    lose_journal(one)
+    one.auctioneer(new_epoch=True)
+    one.until(lambda: one.is_everywhere("a", "finished"))
 
 
 def test_an_award_that_an_arm_still_has_is_adopted(one, monkeypatch):
