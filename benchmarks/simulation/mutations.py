@@ -435,8 +435,9 @@ add_mutation(
 )
 add_mutation(
     "empty-journal",
-    "an auctioneer without a journal does not start beside arms that know one",
+    "an auctioneer without its journal awards nothing to arms that know it",
     (auction_node_module, "check_begin", _nothing),
+    (EpochCheck, "_accept", lambda _: lambda self, history: True),
     alone=False,
 )
 add_mutation(
