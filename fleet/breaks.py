@@ -13,7 +13,7 @@ class Break:
     """A time in which arms take no jobs, such as a break of their operators or maintenance.
 
     In a scenario file, `begin` and `end` may take the place of the times in seconds: as in a job table, `h:mm` from the
-    begin of the shift, with `shift_begin` a time of day; then the break recurs on the `weekdays`, if given.
+    begin of the shift, with `shift_begin` a time of day; then the break recurs on the `weekdays`, by default every day.
     """
 
     name: str

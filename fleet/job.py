@@ -147,6 +147,29 @@ def check_duration(owner: object, dwell_s: float, repetitions: int) -> None:
         )
 
 
+def check_force(owner: object, kind: str, force_n: float) -> None:
+    """Check that only a press has a contact force.
+
+    Raises:
+        ValueError: names the force and the task type.
+    """
+    if force_n and kind != "press":
+        raise ValueError(
+            f"{type(owner).__name__}.force_n must be 0 or left out: only a press has a contact force "
+            f"(got {force_n:g} N for a {kind})."
+        )
+
+
+def check_hard_due(owner: object, expires: bool, due_s: float | None) -> None:
+    """Check that a job with a hard due date has a due date.
+
+    Raises:
+        ValueError: it has none.
+    """
+    if expires and due_s is None:
+        raise ValueError(f"{type(owner).__name__}.due_s is missing: a hard due date needs a time.")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Place:
     """A pose of the hand in the cell; also a station, which one arm at a time may use."""
@@ -237,8 +260,7 @@ class Work:
         check_places(self, self.kind, [place.name for place in self.places])
         check_bounds(self, "payload_kg", "force_n", "dwell_s")
         check_dwell(self, self.kind, self.dwell_s)
-        if self.force_n and self.kind != "press":
-            raise ValueError(f"Only a press has a contact force; this is a {self.kind} with {self.force_n} N.")
+        check_force(self, self.kind, self.force_n)
 
     @cached_property
     def stations(self) -> tuple[str, ...]:

@@ -420,9 +420,14 @@ class Layout:
         return self._lazy(one_each, own, action_mask)
 
     def read_each(self, arms: Sequence[str], shared: Array, own: Array, action_masks: Array) -> dict[str, Observation]:
-        """The observation of each arm by name, from [shared], [arm, own] and masks [arm, option + 2]; see `read`."""
+        """The observation of each arm by name, from [shared], [arm, own] and masks [arm, option + 2]; see `read`.
+
+        Each has arrays of its own: an arm that writes into them changes nothing that another one observes.
+        """
         each = zip(arms, own, action_masks, self.peers, strict=True)
-        return {arm: self._lazy(shared, mine, mask, peers) for arm, mine, mask, peers in each}
+        return {
+            arm: self._lazy(shared.copy(), mine.copy(), mask.copy(), peers.copy()) for arm, mine, mask, peers in each
+        }
 
     def _lazy(self, shared: Array, own: Array, action_mask: Array, peers: Array | None = None) -> Observation:
         """The observation of both parts, which have the same leading axes."""

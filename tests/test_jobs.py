@@ -16,12 +16,13 @@ from scipy import stats
 from fleet.arrivals import Arrivals, arrival_table, sample_arrivals, scale_rate
 from fleet.bus.protocol.auction import JobSpec, Submission
 from fleet.bus.protocol.messages import decode
+from fleet.bus.protocol.operator import check_request
 from fleet.errors import FleetError
 from fleet.jit import kernel
 from fleet.job import Job, Place, Work
 from fleet.robot import Mount
 from fleet.seeding import key_of
-from scenarios.live.requests import explain
+from scenarios.live.requests import explain, read_jobs
 from scenarios.spec.load import load
 from scenarios.spec.parse import parse_scenario
 from scenarios.spec.schema import Scenario
@@ -219,6 +220,19 @@ def test_a_scenario_keeps_the_bounds(field, value):
         high -= load("quickstart").horizon_s
     assert (error is None) == (low <= value <= high)
     assert error is None or field in error
+
+
+def test_only_a_press_has_a_contact_force_wherever_the_job_comes_from(tmp_path):
+    (tmp_path / "jobs.csv").write_text("name,kind,places,force\nj,hold,bench,10\n")
+    job = JobSpec("j", "hold", ("here",), force_n=10.0)
+    makers = (
+        lambda: Work(kind="hold", places=(HERE,), force_n=10.0),
+        lambda: check_request(Submission((job,))),
+        lambda: with_stream("hold", force_n=10.0),
+        lambda: read_jobs(str(tmp_path / "jobs.csv")),
+    )
+    for make in makers:
+        assert "must be 0 or left out: only a press has a contact force (got 10 N for a hold)" in (error_of(make) or "")
 
 
 def test_numbers_that_no_double_holds_name_their_bounds():

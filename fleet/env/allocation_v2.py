@@ -288,7 +288,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         """Current observation of every arm by name, as policies read it."""
         batch = self._begun("knowledge()")
         shared, own = batch.parts
-        return self.layout.read_each(self.possible_agents, shared[0].copy(), own[0].copy(), batch.engine.mask[0].copy())
+        return self.layout.read_each(self.possible_agents, shared[0], own[0], batch.engine.mask[0])
 
     def lookahead(self, simulator: CellSimulator) -> Lookahead:
         """A simulator of the cell in the current episode, for policies that plan."""

@@ -158,7 +158,7 @@ class JobBook(TimedState[BookRecord]):
     roster: tuple[str, ...] = ()
     """All arms among which a majority was counted in this epoch; empty with an auctioneer."""
     time_s: float = 0.0
-    """Latest time of all records."""
+    """Fleet time, at least that of the latest record."""
     number: int = 0
     """Of the next change."""
     ended: bool = False
@@ -208,6 +208,10 @@ class JobBook(TimedState[BookRecord]):
         """Have the open grants without a lease count as leased until this real second."""
         for award in self.open:
             self.leases.setdefault(award, CountedLease(until_s))
+
+    def pass_time(self, time_s: float) -> None:
+        """Set the fleet time, which is that of the next records; it never goes back."""
+        self.time_s = max(self.time_s, time_s)
 
     def record(self, *records: BookRecord) -> None:
         """Write records, then apply them.
@@ -414,7 +418,7 @@ class JobBook(TimedState[BookRecord]):
     def apply(self, record: BookRecord) -> list[Result]:
         """Apply a record that is durable, and return the changes of job states."""
         time_s = getattr(record, "time_s", self.time_s)
-        self.time_s = max(self.time_s, time_s)
+        self.pass_time(time_s)
         by, changed = self._apply(record)
         offers = record.offers if isinstance(record, Granted) else ()
         changes = [self.note_change(self.status_of(entry), time_s, entry, by, offers) for entry in changed]

@@ -1,5 +1,6 @@
 """Commands that evaluate and train policies: compare, bounds, leaderboard and train."""
 
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from math import inf
 from os import cpu_count
@@ -22,6 +23,8 @@ from scenarios.terminal import KEPT, echo, out_console, print_json, progress_bar
 
 if TYPE_CHECKING:
     from scenarios.evaluate.leaderboard import BoardResult
+    from scenarios.prepare.randomisation import Randomisation
+    from scenarios.train.training import Trained
 
 
 Algorithm = Literal["mappo", "ippo"]
@@ -81,9 +84,8 @@ def train_command(
 
     The folder can be used as a policy: `thermofleet compare SCENARIO --policies random,FOLDER`.
     """
-    from scenarios.extras import require_extra
     from scenarios.policy_loader import policy_of, without_simulator
-    from scenarios.spec.load import INSTANCE, load
+    from scenarios.spec.load import INSTANCE
     from scenarios.spec.parse import choose
 
     if (scenario is None) == (suite is None):
@@ -99,53 +101,19 @@ def train_command(
         check_folder(out)
     if suite is not None or INSTANCE.fullmatch(scenario or ""):
         choose("training split", suite or (scenario or "").partition("/")[0], TrainingSplit)
-    from agents.learned.evolution import CURVE
-    from scenarios.train.training import Trained, holds_training
-
     spec, seed = RunSpec(**models), given.pop("seed", 0)
-    sources: Any = {"difficulty": spec.difficulty, "risk": spec.risk}
+    sources = {"difficulty": spec.difficulty, "risk": spec.risk}
     if teacher := given.get("warm_start"):
         without_simulator(teacher, policy_of(teacher))
     length["in_total"] = seeds > 1
     if suite is not None:
-        from agents.learned.evolution import EvolutionConfig
-        from scenarios.evaluate.scores import references_of
-        from scenarios.evaluate.study import suite_of
-        from scenarios.suite.splits import split
-        from scenarios.train.pairs import PairPlan, train_pairs, training_instances
-
-        name = f"{suite}-pairs"
-        chosen = [split(suite)[:instances], split("validation")[:validation_instances]]
-        cases = [*suite_of(suite, 1)[:instances], *suite_of("validation", 1)[:validation_instances]]
-        known = references_of(cases)
-        with progress_bar() as progress:
-            training, validation = (
-                training_instances(each, **sources, known=known, progress=progress) for each in chosen
-            )
-        card = {"suite": suite, **sources, "prepared": len(training), "judges": len(validation)}
-        rate = {field: value for field, value in given.items() if field == "learning_rate"}
-
-        def train_one(where: Path, seed: int, resume: bool) -> Trained:
-            config, plan = EvolutionConfig(seed=seed, **rate), PairPlan(**length)
-            return train_pairs(training, validation, config, where, plan, card=card, resume=resume, tell=say)
+        name, train_one = _pair_training(suite, instances, validation_instances, given, length, sources)
     else:
-        require_extra("learn")
-        from agents.learned.ppo import use_threads
-        from scenarios.train.networks import TrainingPlan, train
+        config = {**given, "algorithm": algo or "mappo", "discount_s": 3600.0 * discount_hours}
+        name, train_one = _network_training(scenario or "", config, length, sources, varied, threads)
 
-        use_threads(threads)
-        scenario_ = load(scenario or "")
-        algorithm = algo or "mappo"
-        name = f"{scenario_.name}-{algorithm}"
-
-        def train_one(where: Path, seed: int, resume: bool) -> Trained:
-            config = PpoConfig(algorithm=algorithm, discount_s=3600.0 * discount_hours, seed=seed, **given)
-            plan: Any = TrainingPlan(**length)
-            with progress_bar() as progress:
-                return train(
-                    scenario_, config, where, plan, randomise=varied, **sources, resume=resume, progress=progress,
-                    tell=say,
-                )  # fmt: skip
+    from agents.learned.evolution import CURVE
+    from scenarios.train.training import holds_training
 
     for k in range(seeds):
         where = out or Path("runs") / f"{name}-{seed + k}"
@@ -162,6 +130,63 @@ def train_command(
         say(f"Curves: {where / CURVE}. Try it: thermofleet compare {how}", out_console)
         if done.interrupted:
             return
+
+
+TrainOne = Callable[[Path, int, bool], "Trained"]
+"""One training into a folder, with a seed; True continues it."""
+
+
+def _pair_training(
+    suite: str, instances: int, validation_instances: int, given: Given, length: Given, sources: dict[str, Any]
+) -> tuple[str, TrainOne]:
+    """Return the name and the training of prices of `bid_price` over instances of the suite."""
+    from agents.learned.evolution import EvolutionConfig
+    from scenarios.evaluate.scores import references_of
+    from scenarios.evaluate.study import suite_of
+    from scenarios.suite.splits import split
+    from scenarios.train.pairs import PairPlan, train_pairs, training_instances
+
+    chosen = [split(suite)[:instances], split("validation")[:validation_instances]]
+    cases = [*suite_of(suite, 1)[:instances], *suite_of("validation", 1)[:validation_instances]]
+    known = references_of(cases)
+    with progress_bar() as progress:
+        training, validation = (training_instances(each, **sources, known=known, progress=progress) for each in chosen)
+    card = {"suite": suite, **sources, "prepared": len(training), "judges": len(validation)}
+    rate = {field: value for field, value in given.items() if field == "learning_rate"}
+
+    def train_one(where: Path, seed: int, resume: bool) -> "Trained":
+        config, plan = EvolutionConfig(seed=seed, **rate), PairPlan(**length)
+        return train_pairs(training, validation, config, where, plan, card=card, resume=resume, tell=say)
+
+    return f"{suite}-pairs", train_one
+
+
+def _network_training(
+    name: str,
+    config: dict[str, Any],
+    length: Given,
+    sources: dict[str, Any],
+    varied: "Randomisation | None",
+    threads: int,
+) -> tuple[str, TrainOne]:
+    """Return the name and the training of a network for a scenario."""
+    from scenarios.extras import require_extra
+    from scenarios.spec.load import load
+
+    require_extra("learn")
+    from agents.learned.ppo import use_threads
+    from scenarios.train.networks import TrainingPlan, train
+
+    use_threads(threads)
+    scenario = load(name)
+
+    def train_one(where: Path, seed: int, resume: bool) -> "Trained":
+        plan = TrainingPlan(**length)
+        how = {"randomise": varied, **sources, "resume": resume, "tell": say}
+        with progress_bar() as progress:
+            return train(scenario, PpoConfig(seed=seed, **config), where, plan, progress=progress, **how)
+
+    return f"{scenario.name}-{config['algorithm']}", train_one
 
 
 def compare_command(

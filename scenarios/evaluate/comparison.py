@@ -22,7 +22,7 @@ from scenarios.evaluate.scores import (
     scores_of,
     unit_of,
 )
-from scenarios.evaluate.statistics import HEAD, LEGEND, Figure, Interval, fewest, figure_rows, figures_of, remarks, unit
+from scenarios.evaluate.statistics import HEAD, LEGEND, Figure, Interval, draws, figure_rows, figures_of, remarks, unit
 from scenarios.evaluate.study import Case, Row, Study, suite_label
 from scenarios.policy_loader import check_name, has_trainings, label, scope_of
 from scenarios.prepare.randomisation import Randomisation
@@ -332,15 +332,14 @@ def comparison_of(
             lead = figures_of_shifts(pair, others[0], (count, *study.shape), groups)[best]["reward"].to_base
         values = scores_over_all(study, rows, references or {})
         scores = scores_of(values, baseline) if values else None
-    fleets, trainings, per_fleet = study.shape
+    *_, per_fleet = study.shape
     sampled = count if groups is None else len(set(cells))
     each_seeds = f", {per_fleet} seeds each" if per_fleet > 1 else ""
-    several = (sampled, study.most_trainings) if count > 1 else (fleets if fleets > 1 else trainings, per_fleet)
     return Comparison(
         scenario=name or rows[0].key.instance,
         seeds=tuple(dict.fromkeys(row.key.seed for row in rows)),
         unit=unit(study.shape) if count == 1 else unit_of(cells) + and_trainings(study.most_trainings) + each_seeds,
-        draws=fewest(several),
+        draws=draws(study.shape if count == 1 else (study.most_trainings, 1, sampled)),
         baseline=baseline,
         figures=figures,
         scopes={each: "failed" if each in failed else scope_of(p) for (p, _), each in study.competitors.items()},

@@ -104,11 +104,12 @@ def interval(values: ArrayLike, *, least: float = -np.inf, most: float = np.inf,
         return Interval(mean, max(low, least), min(high, most), p)
     if x.size == 1:
         return Interval(mean, note=ONE)
-    note = f"no variation in {draws(x)}"
+    count = draws(np.shape(values))
+    note = f"no variation in {count}"
     if not np.isfinite(most - least) or mean not in (least, most):
         return Interval(mean, note=note)
     # All of n values at one end of a range: if the mean were `away` of it, that has less probability than one tail.
-    away = (most - least) * (1 - ((1 - level) / 2) ** (1 / draws(x)))
+    away = (most - least) * (1 - ((1 - level) / 2) ** (1 / count))
     return Interval(mean, max(least, mean - away), min(most, mean + away), note=note)
 
 
@@ -131,14 +132,13 @@ def mean_bounds(values: Array, *, level: float = LEVEL, farthest: float = FARTHE
     """The intervals of many means.
 
     Args:
-        values: [..., fleet, training, seed]. A single fleet or seed counts as fixed, not as a sample; of a single
-            fleet, the trainings are the clusters.
+        values: [..., fleet, training, seed].
         farthest: As `FARTHEST`; 1 gives Student's intervals, inf those without a limit.
     """
     x = np.asarray(values, dtype=float)
     cells = x.mean(axis=-2) if x.shape[-3] > 1 else x[..., 0, :, :]
     mean = cells.mean(axis=(-2, -1))
-    clusters = fewest(cells.shape[-2:])
+    clusters = draws(x.shape)
     variance, third = _moments(cells)
     flat = np.ptp(x, axis=(-3, -2, -1)) <= SAME * np.abs(x).max(axis=(-3, -2, -1))
     if clusters == 1:
@@ -157,9 +157,13 @@ def mean_bounds(values: Array, *, level: float = LEVEL, farthest: float = FARTHE
     return MeanIntervals(mean, mean - above * spread, mean - below * spread, p)
 
 
-def draws(values: Array) -> int:
-    """Independent draws among [seed] or [fleet, training, seed]: the smaller number of clusters, as for a variance."""
-    return fewest((values.shape[0], values.shape[-1]))
+def draws(shape: tuple[int, ...]) -> int:
+    """Independent draws among values [seed] or [..., fleet, training, seed]: the smaller number of clusters.
+
+    A single fleet or seed is given, not a sample. Trainings are within fleets; of a single fleet they are the clusters.
+    """
+    fleets, trainings, seeds = (1, 1, *shape)[-3:]
+    return fewest((fleets if fleets > 1 else trainings, seeds))
 
 
 def fewest(counts: Iterable[int]) -> int:
@@ -259,7 +263,7 @@ def count_interval(values: ArrayLike) -> Interval:
     x = np.asarray(values, dtype=float)
     if x.any() or not x.size:
         return interval(x, least=0.0)
-    return Interval(0.0, *rate_bounds(0, draws(x)), 1.0, f"none in {draws(x)}, Poisson")
+    return Interval(0.0, *rate_bounds(0, draws(x.shape)), 1.0, f"none in {draws(x.shape)}, Poisson")
 
 
 def paired_counts(values: ArrayLike, base: ArrayLike) -> Interval:
@@ -267,8 +271,8 @@ def paired_counts(values: ArrayLike, base: ArrayLike) -> Interval:
     x, y = np.asarray(values, dtype=float), np.asarray(base, dtype=float)
     if x.any() or y.any() or x.shape != y.shape:
         return paired(x, y)
-    most = rate_bounds(0, draws(x))[1]
-    return Interval(0.0, -most, most, 1.0, f"none in {draws(x)}, Poisson")
+    most = rate_bounds(0, draws(x.shape))[1]
+    return Interval(0.0, -most, most, 1.0, f"none in {draws(x.shape)}, Poisson")
 
 
 def holm(p: ArrayLike) -> Array:

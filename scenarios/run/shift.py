@@ -60,19 +60,7 @@ def run(
         FleetError: an option is not allowed, the fleet cannot be prepared, or the folder cannot be written.
         PolicyFailed: a user-defined policy raised an exception or returned no action.
     """
-    if not isinstance(spec, RunSpec | None):
-        raise FleetError(f"Options are given by name, as policy='wspt' (got {spec!r}).")
-    if spec is None:
-        try:
-            spec = RunSpec(**{"bus": "memory", **options})
-        except TypeError as error:
-            unknown = next((name for name in options if name not in RunSpec.__dataclass_fields__), "")
-            allowed = [*RunSpec.__dataclass_fields__, *keywords_of(run)]
-            raise FleetError(f"run() has no option '{unknown}'{nearest(unknown, allowed)}") from error
-        except ValueError as error:
-            raise FleetError(str(error).removeprefix("RunSpec.")) from error
-    elif options:
-        raise FleetError(f"Give either a RunSpec or single options, not both (got {', '.join(options)}).")
+    spec = _spec_of(spec, options)
     check_progress(progress)
     if not callable(stopped):
         raise FleetError(f"stopped must be a function without arguments, as lambda: False (got {stopped!r}).")
@@ -90,11 +78,23 @@ def run(
         spec = _of_fleet(fleet, spec, options)
     else:
         fleet = prepare(fleet, difficulty=spec.difficulty, risk=spec.risk, progress=progress)
-    if target is not None:
-        with argument_names(), new_folder(target, RUN) as folder:
-            log = run(fleet, spec, progress=progress, stopped=stopped, record=record, endpoint=endpoint)
-            log.write(folder)
-        return log
+    if target is None:
+        return _run_shift(fleet, spec, progress, stopped, record, endpoint)
+    with argument_names(), new_folder(target, RUN) as folder:
+        log = _run_shift(fleet, spec, progress, stopped, record, endpoint)
+        log.write(folder)
+    return log
+
+
+def _run_shift(
+    fleet: Fleet,
+    spec: RunSpec,
+    progress: Progress,
+    stopped: Callable[[], bool],
+    record: bool,
+    endpoint: str | None,
+) -> RunLog:
+    """Run one shift of a prepared fleet."""
     shift = f"{fleet.scenario.name}/{spec.seed}"
     with blaming(spec.policy, shift):
         policy = policy_at(spec.policy, spec.seed, OnBus(fleet=fleet.scenario.name))
@@ -136,6 +136,14 @@ def run(
         finished = not env.agents
     finally:
         env.close()
+    return _log_of(fleet, spec, recorder, offers, reward, finished=finished)
+
+
+def _log_of(
+    fleet: Fleet, spec: RunSpec, recorder: "_Recorder", offers: list[Offer], reward: float, *, finished: bool
+) -> RunLog:
+    """Return the log of a shift that has ended."""
+    env = recorder.env
     state, world = env.truth, env.world
     events = tuple(sorted(env.events, key=lambda event: event.time_s))
     heat = recorder.heat or HeatUse(state.temp_c[0].astype(float), fleet.scenario.people.burn_c)
@@ -159,6 +167,28 @@ def run(
         jobs=job_records(world, state),
         offers=tuple(offers),
     )
+
+
+def _spec_of(spec: RunSpec | None, options: Mapping[str, Any]) -> RunSpec:
+    """Return the given spec, or that of the given options.
+
+    Raises:
+        FleetError: an option is not allowed, or both are given.
+    """
+    if not isinstance(spec, RunSpec | None):
+        raise FleetError(f"Options are given by name, as policy='wspt' (got {spec!r}).")
+    if spec is not None:
+        if options:
+            raise FleetError(f"Give either a RunSpec or single options, not both (got {', '.join(options)}).")
+        return spec
+    try:
+        return RunSpec(**{"bus": "memory", **options})
+    except TypeError as error:
+        unknown = next((name for name in options if name not in RunSpec.__dataclass_fields__), "")
+        allowed = [*RunSpec.__dataclass_fields__, *keywords_of(run)]
+        raise FleetError(f"run() has no option '{unknown}'{nearest(unknown, allowed)}") from error
+    except ValueError as error:
+        raise FleetError(str(error).removeprefix("RunSpec.")) from error
 
 
 def _of_fleet(fleet: Fleet, spec: RunSpec, options: Mapping[str, Any]) -> RunSpec:

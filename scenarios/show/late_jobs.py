@@ -9,7 +9,7 @@ import numpy as np
 
 from agents.registry import WORTHLESS_MIN, claims_no_late_jobs
 from fleet.events import Event
-from scenarios.run.records import Halt, JobSpan, Outage, ShiftLog
+from scenarios.run.records import Halt, JobRecord, JobSpan, Outage, ShiftLog
 from scenarios.show.words import clock, duration, names_text
 from scenarios.table import Table
 
@@ -165,9 +165,95 @@ def late_table(log: ShiftLog) -> Table | None:
 
 
 def _reason(log: ShiftLog, late: LateJob) -> str:
-    """Why a job did not begin in time: its own work, a job before it, another job that an arm began in time instead, or
-    what the arms that can do it did until its latest begin."""
+    """Why a job did not begin in time: the first of these rules that applies."""
     own = sorted((span for span in log.plan.assignments if span.job == late.job), key=lambda span: span.start_s)
+    if came_back := _came_back(log, own):
+        return came_back
+    if late.state == "given_up" and not own:
+        return _given_up_with(log, late)
+    record = log.records.get(late.job)
+    if record is None or math.isnan(record.release_s):
+        return "its release is not recorded"
+    wait = _wait_of(log, late, record, own)
+    return (
+        _own_work(wait)
+        or _predecessor(log, wait)
+        or (
+            "" if wait.able else "it was never awarded, and no offer for it or for a job with the same work is recorded"
+        )
+        or _begun_instead(log, wait)
+        or _arms(log, wait)
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Wait:
+    """A late job from its release to its first award."""
+
+    late: LateJob
+    released_s: float
+    end_s: float
+    """First award; without one the due date of an expired job, else the horizon."""
+    begun: bool
+    """Whether it was awarded."""
+    able: Sequence[str]
+    """Arms that can do it, by the record."""
+    work_s: Mapping[str, float]
+    """Time that it takes those of them of which it is recorded, s."""
+    last: JobRecord
+    """The job that finished last of those that it waited for; itself without such a job."""
+    ready_s: float
+    """When that job finished: inf for not yet, -inf without one."""
+
+    @property
+    def shortest_s(self) -> float:
+        """Time that it takes the fastest arm, s; 0 for unknown."""
+        return min(self.work_s.values(), default=0.0)
+
+    @property
+    def latest_s(self) -> float:
+        """Latest begin with which it would have been on time."""
+        return self.late.due_s - self.shortest_s
+
+    @property
+    def begin_s(self) -> float:
+        """From then on it waited for nothing but an arm."""
+        return max(self.released_s, self.ready_s)
+
+    def ahead(self, log: ShiftLog, begin_s: float, end_s: float) -> list[JobSpan]:
+        """Other jobs that the arms that can do it began between two times."""
+        return [
+            span
+            for span in log.plan.assignments
+            if span.arm in self.able and span.job != self.late.job and begin_s <= span.start_s < end_s
+        ]
+
+
+def _wait_of(log: ShiftLog, late: LateJob, record: JobRecord, own: Sequence[JobSpan]) -> _Wait:
+    """The wait of a job with these assignments, in order."""
+    able = log.able_arms(late.job) or []
+    work_s = _work_s(log, late.job, able)
+    end_s = late.due_s if late.state == "expired" else log.plan.horizon_s
+    if own:
+        first = own[0]
+        end_s = first.start_s
+        least_s = 0.0 if first.finished_s else work_s.get(first.arm, 0.0)  # an unfinished job takes longer
+        work_s[first.arm] = max((first.finished_s or first.end_s) - end_s, least_s)
+    last, ready_s = log.last_before.get(late.job, (record, -math.inf))
+    return _Wait(
+        late=late,
+        released_s=record.release_s,
+        end_s=end_s,
+        begun=bool(own),
+        able=able,
+        work_s=work_s,
+        last=last,
+        ready_s=ready_s,
+    )
+
+
+def _came_back(log: ShiftLog, own: Sequence[JobSpan]) -> str:
+    """Why an arm gave back a job that it had begun; "" if none did."""
     for span in own:
         if span.outcome in ("returned", "given_up"):
             absence = next((e for e in log.events if _absence_in(span, e)), None)
@@ -176,70 +262,88 @@ def _reason(log: ShiftLog, late: LateJob) -> str:
                 return f"{span.arm} {what} at {clock(absence.time_s, log.begin)}"
             how = f"{span.arm} {'faulted during' if span.faulted else 'returned'} it at {clock(span.end_s, log.begin)}"
             return how if span.faulted else f"{how}{_return_reason(log, span)}"
-    if late.state == "given_up" and not own:
-        why = next((e.reason for e in log.events if e.kind == "give_up" and e.job == late.job), "")
-        lost = next((each for each in log.jobs_before.get(late.job, ()) if each.state in ABANDONED), None)
-        if lost is not None:
-            return f"it waited for {lost.job}, which {'expired' if lost.state == 'expired' else 'was given up'}"
-        return why or "a job that it waited for was abandoned"
-    begin_s = next((job.release_s for job in log.jobs if job.job == late.job), math.nan)
-    if math.isnan(begin_s):
-        return "its release is not recorded"
-    end_s = own[0].start_s if own else late.due_s if late.state == "expired" else log.plan.horizon_s
-    took_s = (own[0].finished_s or own[0].end_s) - end_s if own else 0.0
-    able = log.able_arms(late.job) or []
-    work_s = _work_s(log, late.job, able)
-    if own:
-        known_s = 0.0 if own[0].finished_s else work_s.get(own[0].arm, 0.0)  # an unfinished job takes longer
-        work_s[own[0].arm] = max(took_s, known_s)
-    shortest_s = min(work_s.values(), default=0.0)
-    if begin_s + shortest_s > late.due_s:
-        wait_s = late.due_s - begin_s
-        due = f"{duration(abs(wait_s))} {'after' if wait_s >= 0 else 'before'} its release"
-        return f"its work takes {duration(shortest_s)}, and it was due {due}" if shortest_s else f"it was due {due}"
-    latest_s = late.due_s - shortest_s
-    last, ready_s = log.last_before.get(late.job, (log.records[late.job], -math.inf))
-    others = [span for span in log.plan.assignments if span.arm in able and span.job != late.job]
+    return ""
+
+
+def _given_up_with(log: ShiftLog, late: LateJob) -> str:
+    """Why a job was abandoned that no arm began."""
+    lost = next((each for each in log.jobs_before.get(late.job, ()) if each.state in ABANDONED), None)
+    if lost is not None:
+        return f"it waited for {lost.job}, which {'expired' if lost.state == 'expired' else 'was given up'}"
+    why = next((e.reason for e in log.events if e.kind == "give_up" and e.job == late.job), "")
+    return why or "a job that it waited for was abandoned"
+
+
+def _own_work(wait: _Wait) -> str:
+    """That it was due before any arm could have finished it; "" otherwise."""
+    given_s, work_s = wait.late.due_s - wait.released_s, wait.shortest_s
+    if work_s <= given_s:
+        return ""
+    due = f"it was due {duration(abs(given_s))} {'after' if given_s >= 0 else 'before'} its release"
+    return f"its work takes {duration(work_s)}, and {due}" if work_s else due
+
+
+def _predecessor(log: ShiftLog, wait: _Wait) -> str:
+    """The job that it waited for beyond its latest begin; "" without one."""
+    half_s = (wait.end_s - wait.released_s) / 2
     # One that never began waited for other reasons afterwards, if that was longer.
-    if ready_s > latest_s and (own or ready_s - begin_s > (end_s - begin_s) / 2):
-        if math.isfinite(ready_s):
-            then = _then(log, late, [span for span in others if ready_s <= span.start_s < end_s], work_s)
-            return f"it waited for {last.job}, which finished at {clock(ready_s, log.begin)}{then}"
-        return f"it waits for {last.job}, which is not finished ({last.state.replace('_', ' ')})"
-    begin_s = max(begin_s, ready_s)
-    if not able:
-        return "it was never awarded, and no offer for it or for a job with the same work is recorded"
-    if in_time := _begun_instead(log, late, work_s, begin_s, end_s):
-        return _passed(log, late, in_time, work_s, in_time=True)
-    halts = {halt_text(log, halt): halt for halt in log.halts if halt.start_s < late.due_s}
-    worthless = not own and end_s - late.due_s >= 60.0 * WORTHLESS_MIN and claims_no_late_jobs(log.policy)
-    rule = f"; {log.policy} begins no job that would end {WORTHLESS_MIN:g} min late" if worthless else ""
-    decided = begin_s < latest_s < end_s and all(arm in work_s for arm in able)  # at its latest begin
-    begun_s, end_s = end_s, latest_s if decided else end_s
-    waits_s = _arm_time(log, able, begin_s, end_s, halts, rule)
-    if all(each.start_s >= late.due_s for each in log.plan.breaks):
-        waits_s.pop(PAUSED)  # it was late before
-    most = max(waits_s, key=lambda why: sum(waits_s[why].values()))
-    longest = {arm: max(halts, key=lambda why: waits_s[why][arm]) for arm in able} if halts else {}
-    halted_s = {arm: waits_s[why][arm] for arm, why in longest.items()}
-    if 0 < sum(halted_s.values()) >= sum(waits_s[most].values()):
-        return names_text(list(dict.fromkeys(longest[arm] for arm in able if halted_s[arm] > 0)))
-    arms = [arm for arm, time_s in waits_s[most].items() if time_s > 0]
+    if wait.ready_s <= wait.latest_s or not (wait.begun or wait.ready_s - wait.released_s > half_s):
+        return ""
+    if math.isinf(wait.ready_s):
+        return f"it waits for {wait.last.job}, which is not finished ({wait.last.state.replace('_', ' ')})"
+    then = _then(log, wait, wait.ready_s)
+    return f"it waited for {wait.last.job}, which finished at {clock(wait.ready_s, log.begin)}{then}"
+
+
+def _begun_instead(log: ShiftLog, wait: _Wait) -> str:
+    """The other jobs that an arm began when this one would still have been on time with it; "" without any.
+
+    Those after which the arm had a break or failed before the late job would have been finished are left out, and those
+    at which the places of the late job were taken.
+    """
+    absences = (*log.plan.breaks, *log.plan.outages)
+
+    def possible(span: JobSpan) -> bool:
+        if span.arm not in wait.work_s:
+            return False
+        done_s = span.start_s + wait.work_s[span.arm]
+        away = any(each.arm == span.arm and span.start_s < each.end_s and each.start_s < done_s for each in absences)
+        return done_s <= wait.late.due_s and not away and not _place_taken(log, wait.late.job, span)
+
+    in_time = list(filter(possible, wait.ahead(log, wait.begin_s, wait.end_s)))
+    return _passed(log, wait, in_time, in_time=True) if in_time else ""
+
+
+def _arms(log: ShiftLog, wait: _Wait) -> str:
+    """What the arms that can do it did for the longest time, until its latest begin if that is recorded."""
+    decided = wait.begin_s < wait.latest_s < wait.end_s and all(arm in wait.work_s for arm in wait.able)
+    end_s = wait.latest_s if decided else wait.end_s
+    halts = {halt_text(log, halt): halt for halt in log.halts if halt.start_s < wait.late.due_s}
+    time_s = _arm_time(log, wait, end_s, halts)
+    if all(each.start_s >= wait.late.due_s for each in log.plan.breaks):
+        time_s.pop(PAUSED)  # it was late before
+    most = max(time_s, key=lambda why: sum(time_s[why].values()))
+    longest = {arm: max(halts, key=lambda why: time_s[why][arm]) for arm in wait.able} if halts else {}
+    halted_s = {arm: time_s[why][arm] for arm, why in longest.items()}
+    if 0 < sum(halted_s.values()) >= sum(time_s[most].values()):
+        return names_text(list(dict.fromkeys(longest[arm] for arm in wait.able if halted_s[arm] > 0)))
+    arms = [arm for arm, own_s in time_s[most].items() if own_s > 0]
     if not arms:
-        return f"what {names_text(able)} did meanwhile is not recorded"
+        return f"what {names_text(wait.able)} did meanwhile is not recorded"
     if not most:
-        return _passed(log, late, [span for span in others if begin_s <= span.start_s < end_s], work_s)
+        return _passed(log, wait, wait.ahead(log, wait.begin_s, end_s))
     be = "" if most == PAUSED else "were " if len(arms) > 1 else "was "
     why = f"{names_text(arms)} {be}{most}"
-    if decided and all(_occupied(log, arm, begin_s, late.due_s - work_s[arm]) for arm in able):
-        why += f"; no arm was free by {clock(latest_s, log.begin)}, its latest begin"
-        why += _then(log, late, [span for span in others if latest_s < span.start_s < begun_s], work_s)
+    if decided and all(_occupied(log, arm, wait.begin_s, wait.late.due_s - wait.work_s[arm]) for arm in wait.able):
+        latest = clock(wait.latest_s, log.begin)
+        why += f"; no arm was free by {latest}, its latest begin{_then(log, wait, wait.latest_s)}"
     return why
 
 
-def _then(log: ShiftLog, late: LateJob, ahead: Sequence[JobSpan], work_s: Mapping[str, float]) -> str:
-    """The jobs that went before a late one after its latest begin, after a semicolon; "" without such jobs."""
-    return f"; then {_passed(log, late, ahead, work_s)}" if ahead else ""
+def _then(log: ShiftLog, wait: _Wait, begin_s: float) -> str:
+    """The jobs that went before a late one from then on, after a semicolon; "" without such jobs."""
+    ahead = wait.ahead(log, begin_s, wait.end_s)
+    return f"; then {_passed(log, wait, ahead)}" if ahead else ""
 
 
 def _work_s(log: ShiftLog, job: str, able: Sequence[str]) -> dict[str, float]:
@@ -255,30 +359,6 @@ def _work_s(log: ShiftLog, job: str, able: Sequence[str]) -> dict[str, float]:
         if like_s:
             times_s[arm] = median(like_s)
     return times_s
-
-
-def _begun_instead(
-    log: ShiftLog, late: LateJob, work_s: Mapping[str, float], begin_s: float, end_s: float
-) -> list[JobSpan]:
-    """Other jobs that an arm began when the late one would still have been on time with it.
-
-    Those after which the arm had a break or failed before the late job would have been finished are left out, and those
-    at which the places of the late job were taken.
-
-    Args:
-        work_s: Time that the job takes each arm.
-        begin_s, end_s: The job waited for nothing but an arm from then on, and until then.
-    """
-    absences = (*log.plan.breaks, *log.plan.outages)
-
-    def possible(span: JobSpan) -> bool:
-        if span.job == late.job or span.arm not in work_s or not begin_s <= span.start_s < end_s:
-            return False
-        done_s = span.start_s + work_s[span.arm]
-        away = any(each.arm == span.arm and span.start_s < each.end_s and each.start_s < done_s for each in absences)
-        return done_s <= late.due_s and not away and not _place_taken(log, late.job, span)
-
-    return list(filter(possible, log.plan.assignments))
 
 
 def _place_taken(log: ShiftLog, job: str, span: JobSpan) -> bool:
@@ -327,14 +407,11 @@ def _return_reason(log: ShiftLog, span: JobSpan) -> str:
     return f": {reason[0].lower()}{reason[1:]}" if reason else ""
 
 
-def _passed(
-    log: ShiftLog, late: LateJob, ahead: Sequence[JobSpan], work_s: Mapping[str, float], *, in_time: bool = False
-) -> str:
+def _passed(log: ShiftLog, wait: _Wait, ahead: Sequence[JobSpan], *, in_time: bool = False) -> str:
     """How many jobs went before a late one on arms that can do it, and what most of them have in common.
 
     Args:
         ahead: These jobs, at least one.
-        work_s: Time that the late job takes each arm.
         in_time: Whether the late job would have been on time instead of each of them; the last one is named then.
     """
     last = max(ahead, key=lambda span: span.start_s)
@@ -342,11 +419,11 @@ def _passed(
     if in_time and len(ahead) == 1:
         return f"at {moment}, still in time, {last.arm} was free and began {last.job} instead"
     records = log.records
-    own = records.get(late.job)
+    own = records.get(wait.late.job)
     took_s = {(o.arm, o.job, o.time_s): o.duration_s for o in log.offers if o.duration_s}
     counts = dict.fromkeys(("shorter", "worth more", "due earlier", "worth more per minute"), 0)
     for span in ahead:
-        span_s, own_s = took_s.get((span.arm, span.job, span.start_s), math.inf), work_s.get(span.arm, 0.0)
+        span_s, own_s = took_s.get((span.arm, span.job, span.start_s), math.inf), wait.work_s.get(span.arm, 0.0)
         counts["shorter"] += span_s < own_s * (1 - SAME)
         if own is not None and (other := records.get(span.job)) is not None:
             counts["worth more"] += other.value > own.value
@@ -361,22 +438,19 @@ def _passed(
     return f"{text}; at {moment}, still in time, {last.arm} began {last.job}" if in_time else text
 
 
-def _arm_time(
-    log: ShiftLog, able: Sequence[str], begin_s: float, end_s: float, halts: Mapping[str, Halt], rule: str
-) -> dict[str, dict[str, float]]:
-    """Time of each arm that can do a job between its release and its award, s, by what the arm did, or by what kept it
-    from getting jobs; "": later jobs.
-
-    Args:
-        rule: Why the policy let the job wait, if it is known; added to what is said of idle arms.
-    """
+def _arm_time(log: ShiftLog, wait: _Wait, end_s: float, halts: Mapping[str, Halt]) -> dict[str, dict[str, float]]:
+    """Time of each arm that can do a job, from when it waits for an arm until `end_s`, s, by what the arm did, or by
+    what kept it from getting jobs; "": later jobs."""
+    able, begin_s = wait.able, wait.begin_s
     slots = int(log.card.get("scenario", {}).get("slots", 0))
     waiting = _most_waiting(log, begin_s, end_s)
     earlier, out, failed = "at work since before its release", "out after a fault", "out after a failure"
     hot, idle = "idle above the warning limit", "idle: the job's place was taken, or the policy let the job wait"
     if 0 < slots < waiting:  # which jobs had the slots is not recorded
         idle = f"{idle}, or it had no slot ({slots} for up to {waiting} waiting jobs)"
-    idle += rule
+    worthless = not wait.begun and wait.end_s - wait.late.due_s >= 60.0 * WORTHLESS_MIN
+    if worthless and claims_no_late_jobs(log.policy):
+        idle += f"; {log.policy} begins no job that would end {WORTHLESS_MIN:g} min late"
     absent = "absent, or no state was recorded"
     whys = (*halts, "", earlier, out, failed, PAUSED, hot, idle, absent)
     time_s = {why: dict.fromkeys(able, 0.0) for why in whys}

@@ -14,7 +14,7 @@ from fleet.job import payload_radius_m
 from fleet.robot import ThermalLimits
 from scenarios.run.log import RunLog
 from scenarios.show.page import HEAT_STEP_S
-from scenarios.show.words import SEVERITY, event_text, offers_text
+from scenarios.show.words import SEVERITY, event_text, joined_breaks, offers_text
 
 Array = np.ndarray
 
@@ -39,7 +39,7 @@ class LogLine:
     severity: str
     """info, warning or error."""
     arm: str
-    """"" for none."""
+    """"" for none; several in words."""
     text: str
 
 
@@ -97,12 +97,12 @@ class Moments:
         return names
 
     def log(self) -> Iterator[LogLine]:
-        """Events in order of time; an award is followed by what each arm offered."""
+        """Events in order of time, a break of several arms as one; an award is followed by what each arm offered."""
         offers = {
             key: list(group)
             for key, group in groupby(self.run.known_offers, key=lambda offer: (offer.time_s, offer.job))
         }
-        for event in sorted(self.run.events, key=lambda event: event.time_s):
+        for event in sorted(joined_breaks(self.run.events, self.run.arms), key=lambda event: event.time_s):
             yield LogLine(event.time_s, SEVERITY.get(event.kind, "info"), event.arm, event_text(event))
             if event.kind == "award" and (made := offers.get((event.time_s, event.job))):
                 made.sort(key=lambda offer: (not offer.awarded, offer.arm))

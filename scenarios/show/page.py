@@ -44,6 +44,8 @@ class Chart:
     figure: Figure
     alt: str
     """Text in place of the figure."""
+    least_px: int = 0
+    """Smallest width, px; on a narrower page it scrolls in its box."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,23 +28,22 @@ MOST_NAMED, MOST_NUMBERS, MOST_ROWS = 16, 24, 40
 LEGEND = "reach {:.2f} m above the floor: dashed outstretched, filled with the tool pointing down"
 ARM_NAME, JOB_NAME = 16, 30
 """Most characters of names in the picture; of jobs also places and scenarios."""
-LETTERS = 170
-"""Of a line of problems, in a picture of full width."""
+LETTERS_PER_IN = 13
+"""Of the lines below a picture."""
 LEAST_IN, MATRIX_IN, IN_PER_M = (7.6, 6.6), 5.4, 0.8
 """Smallest width and height of a picture without exclusions, width of these, and the scale of large cells."""
 
 
 def draw_plan(file: Path, scenario: Scenario, report: LayoutReport) -> None:
-    """Write the plan of a cell as PNG, also of one with problems, which stand below it."""
+    """Write the plan of a cell as PNG, also of one with problems. These stand below it, as do names without room."""
     tasks = list(dict.fromkeys(task for e in report.exclusions for task in zip(e.arms, e.jobs, strict=True)))
     tasks.sort(key=lambda task: [arm.name for arm in scenario.arms].index(task[0]))
     matrix = 0 < len(tasks) <= MOST_ROWS
-    lines = [
-        line for each in report.problems for line in textwrap.wrap(f"✗ {each}", LETTERS if matrix else LETTERS // 2)
-    ]
     points_m = [each.position_m[:2] for each in (*scenario.arms, *scenario.places)]
     wide, high = np.maximum(LEAST_IN, IN_PER_M * (np.ptp(points_m, axis=0) + 2 * REACH_M)).tolist()
     widths = (wide, MATRIX_IN) if matrix else (wide,)
+    letters = round(LETTERS_PER_IN * sum(widths))
+    lines = [line for each in report.problems for line in textwrap.wrap(f"✗ {each}", letters)]
     figure = Figure(figsize=(sum(widths), high + 0.2 * len(lines)), layout="constrained")
     FigureCanvasAgg(figure)
     grid: Any = figure.add_gridspec(1, len(widths), width_ratios=widths)
@@ -57,7 +56,8 @@ def draw_plan(file: Path, scenario: Scenario, report: LayoutReport) -> None:
     figure.supxlabel("\n".join(lines), x=0.01, ha="left", color=FAULT, fontsize=9)
     figure.draw_without_rendering()  # decides the scale of the axes
     figure.set_layout_engine("none")
-    _write_labels(axes, labels)
+    numbered = ", ".join(f"{number} {name}" for number, name in enumerate(_write_labels(axes, labels), start=1))
+    figure.text(0.01, 0.0, textwrap.fill(numbered, letters), va="top", color=INK, fontsize=9)
     figure.savefig(file, format="png", bbox_inches="tight")
 
 
@@ -154,28 +154,36 @@ class Label:
     colour: str
 
 
-def _write_labels(axes: Axes, labels: Sequence[Label]) -> None:
-    """Write each label on a side of its point where it covers no point and no other label; without one, leave it out.
+def _write_labels(axes: Axes, labels: Sequence[Label]) -> list[str]:
+    """Write each label where it covers no point and no other: on a side of its point, else upright above or below it.
 
-    Those in red come first.
+    Those in red come first. Points without room for their labels get the numbers 1, 2, … instead.
+
+    Returns:
+        The texts of the numbers, in order.
     """
     points = axes.transData.transform([label.at_m for label in labels])
     taken = [Bbox.from_extents(x - 6, y - 6, x + 6, y + 6) for x, y in points]
     named = [(label, *point) for label, point in zip(labels, points, strict=True) if label.text]
+    numbered = list[str]()
     for label, x, y in sorted(named, key=lambda each: each[0].colour != FAULT):
         how: Any = {"ha": "center", "va": "center", "color": label.colour, "fontsize": 8, "zorder": 5}
         note = axes.annotate(label.text, tuple(label.at_m), (0, 0), textcoords="offset pixels", **how)
         box = note.get_window_extent()
-        beside, below = 9 + box.width / 2, 9 + box.height / 2
-        for aside in ((beside, 0), (-beside, 0), (0, -below), (0, below)):
-            low = (x + aside[0] - box.width / 2, y + aside[1] - box.height / 2)
-            place = Bbox.from_bounds(*low, box.width + 3, box.height)
+        beside, below, upright = 9 + box.width / 2, 9 + box.height / 2, 9 + box.width / 2
+        level = [((aside, 0), 0) for aside in (beside, -beside)] + [((0, aside), 0) for aside in (-below, below)]
+        for aside, turn in (*level, ((0, -upright), 90), ((0, upright), 90)):
+            size = (box.height, box.width) if turn else (box.width + 3, box.height)
+            place = Bbox.from_bounds(x + aside[0] - size[0] / 2, y + aside[1] - size[1] / 2, *size)
             if not place.count_overlaps(taken):
                 note.set_position(aside)
+                note.set_rotation(turn)
                 taken.append(place)
                 break
         else:
-            note.remove()
+            numbered.append(label.text.replace("\n", ", "))
+            note.set(text=str(len(numbered)), fontsize=7, bbox={"boxstyle": "round,pad=0.1", "fc": "white", "lw": 0.5})
+    return numbered
 
 
 def _draw_cell(axes: Axes, scenario: Scenario, report: LayoutReport) -> list[Label]:
@@ -215,7 +223,7 @@ def _draw_cell(axes: Axes, scenario: Scenario, report: LayoutReport) -> list[Lab
     axes.set_aspect("equal")
     axes.autoscale_view()
     axes.grid(color="#e6e6e6", zorder=-1)
-    axes.set(xlabel=f"x, m\n{LEGEND.format(height_m)}\nnames without room are left out", ylabel="y, m")
+    axes.set(xlabel=f"x, m\n{LEGEND.format(height_m)}", ylabel="y, m")
     title = shortened(scenario.name, JOB_NAME)
     axes.set_title(f"{title}: {len(report.at_once)} of {len(scenario.arms)} arms can work at once (lines)")
     return labels

@@ -23,7 +23,16 @@ from scenarios.show.late_jobs import (
 )
 from scenarios.show.page import Badge, Chart, Head, Page, Playback, Section, packed
 from scenarios.show.timeline import STREAM_NAME, hottest_motors, shift_charts, time_unit
-from scenarios.show.words import clock, duration, kind_text, names_text, offer_text, offers_text, value_text
+from scenarios.show.words import (
+    clock,
+    duration,
+    joined_breaks,
+    kind_text,
+    names_text,
+    offer_text,
+    offers_text,
+    value_text,
+)
 from scenarios.table import Column, Moment, Table, render
 
 MOST_FAULTS = 2
@@ -417,7 +426,7 @@ def numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
 
 def _event_section(log: ShiftLog) -> Section:
     """The notable events and notices by time, how many there are, and which are left out."""
-    notable = [e for e in _joined_breaks(log) if e.kind in NOTABLE]
+    notable = [e for e in joined_breaks((*log.events, *log.notices), log.arms) if e.kind in NOTABLE]
     if not notable:
         return Section(key="log", title="Events", sentences=("No fault, no warning, no lost claim.",))
     first = sorted(notable, key=lambda e: (NOTABLE.index(e.kind), e.time_s))
@@ -437,19 +446,6 @@ def _event_section(log: ShiftLog) -> Section:
     kinds, moments = [e.kind for e in listed], [_before(event) for event in listed]
     shown = table.html(style="events", key="events", kinds=kinds, moments=moments)
     return Section(key="log", title="Events", sentences=tuple(sentences), html=shown)
-
-
-def _joined_breaks(log: ShiftLog) -> Iterator[Event | Notice]:
-    """Yield events and notices; the events of arms whose breaks begin, or end, in the same second as one."""
-    breaks = dict[tuple[str, int, str], list[Event | Notice]]()
-    for event in (*log.events, *log.notices):
-        if event.kind in ("break", "break_end"):
-            breaks.setdefault((event.kind, round(event.time_s), event.reason), []).append(event)
-        else:
-            yield event
-    for alike in breaks.values():
-        arms = {each.arm for each in alike}
-        yield replace(alike[0], arm=names_text([arm for arm in log.arms if arm in arms]))
 
 
 def _before(event: Event | Notice) -> Moment:
@@ -523,6 +519,37 @@ def other_choices(log: ShiftLog, other: ShiftLog) -> list[str]:
     return lines
 
 
+SETTINGS = {
+    "policy": "policy",
+    "seed": "seed",
+    "difficulty": "predictions",
+    "risk": "risk",
+    "plant": "plant",
+    "bus": "bus",
+}
+"""Settings of a run that the table of several runs has, by their keys in the card."""
+LONG_SETTINGS = {
+    "scenario_hash": ("content of the scenario", ("scenario",)),
+    "channel": ("channel between the arms", ("scenario",)),
+    "twins": ("twins", ("scenario", "predictions")),
+    "versions": ("versions of libraries", ()),
+    "code_hash": ("code", ()),
+}
+"""Other settings by their keys: name, and the settings of which each, if it differs, explains a difference of this."""
+
+
+def _differences(logs: Mapping[str, ShiftLog]) -> list[str]:
+    """Names of the settings in which runs differ."""
+
+    def differ(key: str) -> bool:
+        first, *others = (log.card.get(key) for log in logs.values())
+        return any(each != first for each in others)
+
+    names = ["scenario"] if len({log.card.get("scenario", {}).get("name") for log in logs.values()}) > 1 else []
+    names += [name for key, name in SETTINGS.items() if differ(key)]
+    return names + [name for key, (name, causes) in LONG_SETTINGS.items() if differ(key) and not {*causes} & {*names}]
+
+
 def runs_table(logs: Mapping[str, ShiftLog], *, in_file: bool = False) -> Table:
     """Settings, outcome and key figures, a column for each run by its name; "" for a figure that a run lacks.
 
@@ -531,9 +558,7 @@ def runs_table(logs: Mapping[str, ShiftLog], *, in_file: bool = False) -> Table:
     """
     settings = {
         "scenario": [str(log.card.get("scenario", {}).get("name", "")) for log in logs.values()],
-        "policy": [log.policy for log in logs.values()],
-        "seed": [str(log.card.get("seed", "")) for log in logs.values()],
-        "predictions": [str(log.card.get("difficulty", "")) for log in logs.values()],
+        **{name: [str(log.card.get(key, "")) for log in logs.values()] for key, name in SETTINGS.items()},
         "outcome": [verdict(log).badge for log in logs.values()],
     }
     figures = figure_table({name: log.card.get("metrics") or {} for name, log in logs.items()}, in_file=in_file)
@@ -610,12 +635,7 @@ def runs_page(
         model: As in `report_html`, of shifts in one cell: their movements are shown in step.
     """
     table = runs_table(logs)
-    settings = {row[0]: set(row[1 : len(logs) + 1]) for row in table.rows[:4]}
-    differ = [name for name, values in settings.items() if len(values) > 1]
-    for name, key in (("content of the scenario", "scenario_hash"), ("code", "code_hash")):
-        hidden = "scenario" not in differ or key == "code_hash"  # of other scenarios other content is no news
-        if hidden and len({log.card.get(key) for log in logs.values()}) > 1:
-            differ.append(name)
+    differ = _differences(logs)
     first_jobs, *other_jobs = map(_given_jobs, logs.values())
     equal_jobs = all(each == first_jobs for each in other_jobs)
     if not equal_jobs:

@@ -62,6 +62,8 @@ LEAST_ERROR = 1e-6
 """Errors below it, in z units, count as equal."""
 MOST_POINTS = 1500
 """Points of a line; a long recording is drawn with fewer samples."""
+OWN_AXES_PX = 600
+"""Least width of panels side by side that each have a y axis, so that no label covers another panel."""
 QUANTILES = {"lowerfence": 5, "q1": 25, "median": 50, "q3": 75, "upperfence": 95}
 COOL, BETWEEN, HOT = 0, 1, 2
 """Kinds of jobs and windows."""
@@ -503,7 +505,7 @@ def latent_chapter(subjects: Sequence[Subject], size: Size) -> Section:
         ),
         how=f"Posterior means of {len(s.windows)} test windows under the network of joint {s.joint + 1}. The distance "
         "is that of Mahalanobis from the means of the training windows.",
-        charts=_charts("latent", cells, x="μ₁", y=("μ₂",), heads=tuple(s.networks), height=420),
+        charts=panels("latent", cells, x="μ₁", y=("μ₂",), heads=tuple(s.networks), height=420),
         tables=(
             Table(
                 head=("hot against cool windows", "AUROC"),
@@ -571,7 +573,8 @@ def difficulty_chapter(subjects: Sequence[Subject], size: Size) -> Section:
         if chosen.any():
             name = f"{s.kinds[kind]} ({chosen.sum()} {s.item}s)"
             quantiles = {n: _plain(np.percentile(d[chosen], q, axis=0)) for n, q in QUANTILES.items()}
-            cells[0, 0].append({"type": "box", "x": _joints(s), "name": name, "marker": {"color": colour}} | quantiles)
+            joints = [str(j + 1) for j in range(s.twin.joints)]
+            cells[0, 0].append({"type": "box", "x": joints, "name": name, "marker": {"color": colour}} | quantiles)
             rows.append(_row(f"median, {name}", np.median(with_total(d[chosen]), axis=0), ".3f"))
     for name, i in zip(("cool", "hot"), s.examples, strict=True):
         rows.append(_row(f"the {name} example", with_total(s.recorded.difficulty[i]), ".3f"))
@@ -585,7 +588,7 @@ def difficulty_chapter(subjects: Sequence[Subject], size: Size) -> Section:
         ),
         how="d_k = 1 − exp(−e_k), e_k the mean absolute error of joint k summed over the channels; d is their sum with "
         f"the weights of the twin. {_seeds(len(subjects))}",
-        charts=_charts("difficulty", cells, x="", y=("d of the joint",), heads=("",), height=420),
+        charts=panels("difficulty", cells, x="joint", y=("d of the joint",), heads=("",), height=420),
         tables=(
             Table(head=("", *_joints(s), "d"), rows=tuple(rows)),
             Table(head=(f"h{against}", "AUROC"), rows=tuple((name, spread(each)) for name, each in by_name.items())),
@@ -631,7 +634,7 @@ def epochs_chapter(subjects: Sequence[Subject], size: Size) -> Section:
         how=f"A separate training for each number of epochs and each of {len(seeds)} seeds, on a record of "
         f"{s.epoch_records} cool {s.item}s; other cool {s.item}s are held out. Joint {s.joint + 1}; errors in standard "
         "deviations of the training data, mean ± standard deviation over the seeds.",
-        charts=_charts("epochs", cells, x="epochs", y=("mean |error| (σ)",), heads=(*CHANNEL_NAMES, "AUROC, hot")),
+        charts=panels("epochs", cells, x="epochs", y=("mean |error| (σ)",), heads=(*CHANNEL_NAMES, "AUROC, hot")),
         tables=(Table(head=("mean |error|, σ", *x), rows=tuple(rows)),),
         numbers={"epochs": size.epochs, **of_joint, "auroc": ranks, "auroc_rms_torque": torque},
     )
@@ -711,10 +714,10 @@ def _over_epochs(x: Sequence[str], y: Array, name: str, colour: str) -> Trace:
 
 def _over_time(key: str, cells: Cells, heads: Sequence[str], y: Sequence[str] = CHANNEL_HEADS) -> tuple[Chart, ...]:
     """Channels over time, a row each, with the same y axis in all columns."""
-    return _charts(key, cells, x="time, s", y=y, heads=heads, shared=True)
+    return panels(key, cells, x="time, s", y=y, heads=heads, shared=True)
 
 
-def _charts(
+def panels(
     key: str, cells: Cells, *, x: str, y: Sequence[str], heads: Sequence[str], height: int = 0, shared: bool = False
 ) -> tuple[Chart, ...]:
     """A grid of panels as the chart of a section.
@@ -730,7 +733,8 @@ def _charts(
     from plotly.subplots import make_subplots
 
     rows, columns = (1 + max(place[axis] for place in cells) for axis in (0, 1))
-    sharing = {"shared_yaxes": shared, "horizontal_spacing": 0.06, "vertical_spacing": 0.3 / (rows + 1)}
+    gap = 0.06 if shared else 0.09
+    sharing = {"shared_yaxes": shared, "horizontal_spacing": gap, "vertical_spacing": 0.3 / (rows + 1)}
     figure = make_subplots(rows, columns, subplot_titles=heads, **sharing)
     named = set[str]()
     for (row, column), traces in sorted(cells.items()):
@@ -746,13 +750,14 @@ def _charts(
         legend={"orientation": "h", "x": 0, "y": 1, "yref": "container", "yanchor": "top"},
     )
     figure.update_annotations(font_size=12)
-    figure.update_xaxes(AXIS, type="category" if x == "epochs" else "-")
+    figure.update_xaxes(AXIS, type="category" if x in ("epochs", "joint") else "-")
     figure.update_yaxes(AXIS)
     figure.update_xaxes(title_text=x, row=rows)
     for row, title in enumerate(y):
-        figure.update_yaxes(title_text=title, row=row + 1, col=1)
-    alt = f"{', '.join(y)} by {x or 'joint'}: {', '.join(filter(None, heads)) or 'cool and hot'}"
-    return (Chart(key=f"chart_{key}", figure=figure.to_plotly_json(), alt=alt),)
+        figure.update_yaxes(title={"text": title, "standoff": 4}, automargin=True, row=row + 1, col=1)
+    alt = f"{', '.join(y)} by {x}: {', '.join(filter(None, heads)) or 'cool and hot'}"
+    least_px = OWN_AXES_PX if columns > 1 and not shared else 0
+    return (Chart(key=f"chart_{key}", figure=figure.to_plotly_json(), alt=alt, least_px=least_px),)
 
 
 # The report.

@@ -1,16 +1,18 @@
 """Times, events and offers in words."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from datetime import datetime
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from fleet.events import Event
 from scenarios.spec.calendar import date_at, moment_text
 
 if TYPE_CHECKING:  # slow to import
     from fleet.bus.protocol.auction import ArmEvent
-    from scenarios.run.records import Offer
+    from scenarios.run.records import Notice, Offer
 
+Entry = TypeVar("Entry", bound="Event | Notice")
 SEVERITY = {
     "warning": "warning", "torque_warning": "warning", "return": "warning", "give_up": "error", "expire": "warning",
     "fault": "error", "contact": "error", "illegal": "warning",
@@ -79,6 +81,23 @@ def event_text(event: "Event | ArmEvent") -> str:
     joint = f", joint {event.joint}" if event.joint else ""
     reason = f": {event.reason}" if event.reason else ""
     return f"{event.kind.replace('_', ' ')}{f' {event.job}' if event.job else ''}{joint}{reason}"
+
+
+def joined_breaks(events: Iterable[Entry], arms: Sequence[str]) -> Iterator[Entry]:
+    """Yield events; those of arms whose breaks begin, or end, in the same second as one, last.
+
+    Args:
+        arms: All arms, in the order in which they are named.
+    """
+    breaks = dict[tuple[str, int, str], list[Entry]]()
+    for event in events:
+        if event.kind in ("break", "break_end"):
+            breaks.setdefault((event.kind, round(event.time_s), event.reason), []).append(event)
+        else:
+            yield event
+    for alike in breaks.values():
+        own = {each.arm for each in alike}
+        yield replace(alike[0], arm=names_text([arm for arm in arms if arm in own]))
 
 
 def offer_text(offer: "Offer") -> str:

@@ -1,8 +1,9 @@
 """The calendar of a shift: breaks and recurring jobs at times of day, and the absences of arms in ticks.
 
 A scenario file gives `begin` and `end` of a break as a job table does: in seconds or `h:mm` from the begin of the
-shift, or as dates; with `shift_begin`, `h:mm` is a time of day. With `weekdays` a break recurs on these days, and so do
-arrivals of kind `weekly`. They become plain times here, so the rest of the product knows no calendar.
+shift, or as dates; with `shift_begin`, `h:mm` is a time of day. A break between times of day recurs on its `weekdays`,
+by default every day, and so do arrivals of kind `weekly`. They become plain times here, so the rest of the product
+knows no calendar.
 """
 
 import logging
@@ -131,23 +132,22 @@ def _break_times(
             "to 24:00."
         )
     if next_day and last - first > LONGEST_NIGHT and last != DAY:
-        advice = "as two, to 24:00 and from 0:00 on the next days" if "weekdays" in given else "with dates"
         raise ScenarioError(
             f"{where}: {given['begin']} to {given['end']} lasts {(last - first) / HOUR:.4g} h over midnight, but at "
-            f"most {LONGEST_NIGHT / HOUR:g} h are taken: are begin and end exchanged? Give a longer break {advice}."
+            f"most {LONGEST_NIGHT / HOUR:g} h are taken: are begin and end exchanged? Give a longer break as two, to "
+            "24:00 and from 0:00 on the next days, or with dates for a single one."
         )
-    found, touched = list[dict[str, Any]](), False
+    touched = False
     for day_s, date in _days(given.get("weekdays", list(WEEKDAYS)), begin, horizon_s, where):
         begin_s, end_s = day_s(date, first), day_s(date, last)
         touched |= end_s > 0 and begin_s < horizon_s
         if end_s > max(0.0, begin_s) and begin_s < horizon_s:  # not within the hour that summer time leaves out
-            found.append(entry | {"begin_s": begin_s, "end_s": end_s})
+            yield entry | {"begin_s": begin_s, "end_s": end_s}
     if not touched and "weekdays" not in given:
         raise ScenarioError(
             f"{where}: {given['begin']} to {given['end']} is outside the shift, which begins at {begin:%H:%M} and ends "
             f"{horizon_s / 3600.0:.3g} h later."
         )
-    yield from found if "weekdays" in given else found[:1]
 
 
 def _recurring(stream: Any, begin: datetime | None, horizon_s: float, where: str) -> Any:

@@ -27,7 +27,17 @@ from msgspec.structs import replace
 from fleet.bus.protocol.auction import Admission, JobSpec, JobStatus
 from fleet.errors import ScenarioError, check_names, nearest, printable
 from fleet.files import decode_text
-from fleet.job import BOUNDS, DWELL_S, KINDS, check_alternatives, check_bounds, check_duration, check_dwell
+from fleet.job import (
+    BOUNDS,
+    DWELL_S,
+    KINDS,
+    check_alternatives,
+    check_bounds,
+    check_duration,
+    check_dwell,
+    check_force,
+    check_hard_due,
+)
 from scenarios.spec.units import check_times, question
 
 _LOG = logging.getLogger(__name__)
@@ -543,7 +553,8 @@ def _problems(row: Row, wrong: Collection[str]) -> Iterator[tuple[str, str]]:
         ("dwell_s", lambda: check_dwell(row, row.kind, row.dwell_s)),
         ("repetitions", lambda: check_duration(row, row.dwell_s, row.repetitions)),
         ("due_s", lambda: _check_due(row)),
-        ("force_n", lambda: _check_force(row)),
+        ("due_s", lambda: check_hard_due(row, row.expires, row.due_s)),
+        ("force_n", lambda: check_force(row, row.kind, row.force_n) if row.kind else None),
     ]
     bad = set(wrong)
     for field, check in checks:
@@ -560,19 +571,12 @@ def _check_due(row: Row) -> None:
     if row.due_s is not None and row.due_s < row.release_s:
         release, due = (_given_time(row, field) for field in ("release_s", "due_s"))
         raise ValueError(f"must not be before the release at {release} (got {due})")
-    if row.expires and row.due_s is None:
-        raise ValueError("a hard due date needs a time")
 
 
 def _given_time(row: Row, field: str) -> str:
     """A time of a row as it was given; a plain number in seconds."""
     text = row.texts.get(field, "")
     return printable(text, 60) if ":" in text else f"{getattr(row, field):.15g} s"
-
-
-def _check_force(row: Row) -> None:
-    if row.force_n and row.kind not in ("", "press"):
-        raise ValueError(f"only a press has a contact force (got {row.force_n:g} N for a {row.kind})")
 
 
 def with_cell(answer: Answer, jobs: Mapping[str, tuple[str, JobSpec]]) -> Answer:

@@ -22,6 +22,7 @@ from fleet.job import (
     check_bounds,
     check_duration,
     check_dwell,
+    check_force,
 )
 from fleet.observation import MOST_SLOTS
 from fleet.robot import Cooling, Mount, Robot, ThermalLimits
@@ -137,8 +138,7 @@ class JobStream:
             raise ValueError(f"JobStream.repetitions must be [fewest, most] (got {low}, {high})")
         check_dwell(self, self.kind, self.dwell_s)
         check_duration(self, self.dwell_s, high)
-        if self.force_n and self.kind != "press":
-            raise ValueError(f"JobStream.force_n: only a press has a contact force (got {self.force_n} N)")
+        check_force(self, self.kind, self.force_n)
         if not self.numbered and len(self.arrivals.times_s or ()) != 1:
             raise ValueError("JobStream.numbered = false is for streams of one job: arrivals with one time in times_s")
 

@@ -452,11 +452,11 @@ def test_participants_may_send_fields_of_a_later_version():
         (ControlRequest("1", Change("a")), "Change needs due_s, value or both (got neither)."),
         (
             trade.Submission((JobSpec("a", "hold", ("rack",), expires=True),)),
-            "JobSpec.expires needs due_s, the hard due date (got none for 'a').",
+            "Job 'a': JobSpec.due_s is missing: a hard due date needs a time.",
         ),
         (
             trade.Submission((JobSpec("a", "hold", ("rack",), force_n=10.0),)),
-            "only a press has a contact force (got 10 N for the hold 'a').",
+            "Job 'a': JobSpec.force_n must be 0 or left out: only a press has a contact force (got 10 N for a hold).",
         ),
     ],
 )

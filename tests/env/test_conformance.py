@@ -31,6 +31,7 @@ from fleet.engine.batch import TERMS
 from fleet.env import allocation_v2
 from fleet.env.allocation_v2 import AllocationEnv
 from fleet.env.random_actions import random_legal
+from fleet.observation import FIELDS
 
 HOT = {"arms": 3, "ambient_c": 38.0}
 
@@ -164,9 +165,12 @@ def test_returned_objects_belong_to_the_caller(make, play, keep_events) -> None:
         for part in handed:
             part["__all__"] = part.pop("arm_0")  # as RLlib does
         env.state()[:] = 0.0
-        for observed in env.knowledge().values():
-            observed.temp_c[:] = 0.0
-            observed.action_mask[:] = 0
+        known, others = env.knowledge(), untouched.knowledge()
+        for field in FIELDS:
+            np.asarray(getattr(known["arm_0"], field.name))[...] = 0.0
+        known["arm_0"].peers[:] = known["arm_0"].action_mask[:] = 0
+        for arm in env.possible_agents[1:]:  # what an arm writes into its own observation, no other arm observes
+            assert play.plain(play.named(known[arm])) == play.plain(play.named(others[arm]))
         assert play.plain(env.state()) == play.plain(untouched.state())
         for arm, observed in untouched.knowledge().items():
             assert play.plain(play.named(env.knowledge()[arm])) == play.plain(play.named(observed))

@@ -17,9 +17,9 @@ from benchmarks.simulation.machine import SimulatedEstimator
 from benchmarks.simulation.participants import CLIENT, simulated_system
 from benchmarks.simulation.simulated_fleet import FIRST
 from fleet.bus.client import AnotherReplies
-from fleet.bus.protocol.auction import Ack, Award
-from fleet.bus.protocol.keys import of_arm
-from fleet.bus.protocol.operator import Settle
+from fleet.bus.protocol.auction import Ack, Award, Status, StatusRequest
+from fleet.bus.protocol.keys import of_arm, of_jobs
+from fleet.bus.protocol.operator import Pause, Settle
 from fleet.errors import BusError
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.space import ANYWHERE
@@ -51,6 +51,7 @@ def greedy(difficulty: dict[str, dict[str, float]], able: list[str]) -> dict[str
 
 
 @example(29830, 2, 1)  # the bid of one arm came later than the other had chosen
+@example(15098, 5, 3)  # an arm chose by a bid of a peer from before the grant to that peer
 @example(118385827, 2, 2)  # so did that of a faulted arm, by which its peer knows how well each job suits it
 @examples(8)
 @given(st.integers(0, 2**32), st.integers(1, 5), st.integers(1, 4))
@@ -98,6 +99,15 @@ def both_second(arm: str, space: str, other: str, other_space: str) -> bool:
 def drop_choice(handle, arm: str, bid) -> None:
     if not bid.choice:
         handle(arm, bid)
+
+
+def test_an_award_has_the_time_at_which_it_was_granted(fleet_of):
+    """Not that of the last record before it."""
+    fleet = fleet_of(True)
+    fleet.submit(job("a", 1, release_s=200.0))
+    fleet.until(lambda: len(fleet.finished) == 1)
+    times = {each.status.state: each.time_s for arm in fleet.arms for each in fleet.node(arm).work_source.book.recent}
+    assert 200.0 <= times["awarded"] <= times["finished"]
 
 
 def offered(arm: str, name: str) -> tuple:
@@ -460,7 +470,7 @@ def test_without_a_majority_no_job_is_accepted(fleet_of):
     fleet.world.split({"arm_2": 1, CLIENT: 1})
     fleet.run(12.0)
     here, there = (job("a", 2, place=place, release_s=1000.0) for place in ("here", "there"))
-    reason = "A majority of the arms, 2, must be present. Submit it again then."
+    reason = "1 of 3 arms present: a majority, 2, is needed. Submit it again then."
     assert refused(lambda: fleet.submit(here)) == reason
     assert fleet.known() == [{}, {}, {}]
     fleet.world.split({"arm_2": 1})
@@ -482,3 +492,25 @@ def test_an_arm_that_restarts_without_a_majority_replies_to_clients_and_neither_
     assert not fleet.node("arm_0").work_source.participant.claimant._sent
     fleet.world.processes["arm_2"].start()
     fleet.until(lambda: bool(fleet.node("arm_0").work_source.participant.claimant._sent))
+
+
+def status_of(fleet: SimulatedFleet) -> Status:
+    return fleet.ask(of_jobs("f", "status"), StatusRequest(), Status)
+
+
+def test_the_first_arms_of_a_fleet_say_that_they_are_too_few():
+    """Before a majority has begun the fleet's time, clients get the reason instead of no reply."""
+    fleet = SimulatedFleet(True, 4)
+    with simulated_system(fleet.world):
+        for name in (CLIENT, "arm_1", "arm_2"):
+            fleet.world.processes[name].start()
+        fleet.run(12.0)
+        reason = "2 of 4 arms present: a majority, 3, is needed."
+        reply = status_of(fleet)
+        assert (reply.auctioneer, reply.trouble, reply.time_s) == ("arm_1", reason, 0.0)
+        assert refused(lambda: fleet.submit(job("a", 1))) == f"{reason} Submit it again then."
+        assert refused(lambda: fleet.control(Pause("arm_1"))) == f"{reason} Ask again then."
+        fleet.world.processes["arm_0"].start()
+        fleet.until(lambda: begun(fleet, "arm_0"))
+        assert status_of(fleet).trouble == ""
+        assert fleet.submit(job("a", 1))[0].accepted

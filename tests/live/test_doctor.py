@@ -202,6 +202,11 @@ def test_a_fleet_that_needs_no_auctioneer_is_healthy_without_one():
     assert "2 auctioneers" in faults(fleet(arm(), auctioneers=(*ALONE, *ALONE)), auctioneer=False)[0][0]
 
 
+def test_no_auctioneer_is_missed_where_an_arm_replies_about_the_jobs():
+    now = fleet(arm(), auctioneers=(AuctioneerSnapshot("a", False, 0.5, "1 of 4 arms present."),))
+    assert faults(now, ClockProbe(100.0, 100.1))[0] == ["1 of 4 arms present."]
+
+
 def test_malformed_messages_are_a_fault_with_each_reason_once():
     output, _ = faults(fleet(arm()), malformed=3, complaints={"a": "no JSON.", "b": "no State.", "c": "no JSON."})
     assert output == ["3 malformed message(s), the last: no JSON.; no State."]

@@ -95,7 +95,7 @@ def test_a_blind_arm_estimates_without_a_score(arm):
     [
         ({"places": ("moon",)}, "no place 'moon' in this cell; places: bench"),
         ({"payload_kg": 9.0}, "at 'bench': torque: too much"),
-        ({"force_n": 3.0}, "Only a press"),
+        ({"force_n": 3.0}, "only a press"),
     ],
 )
 def test_an_infeasible_job_has_a_reason(arm, changes, reason):

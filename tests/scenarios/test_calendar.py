@@ -54,7 +54,8 @@ def hours(scenario: Scenario) -> list[tuple[float, float]]:
     ],
 )  # fmt: skip
 def test_a_break_has_the_times_that_are_meant(begin, end, fields, expected) -> None:
-    assert hours(with_breaks({"name": "lunch", "begin": begin, "end": end}, **fields)) == [expected]
+    scenario = with_breaks({"name": "lunch", "begin": begin, "end": end}, horizon_s=26 * HOUR_S, **fields)
+    assert hours(scenario) == [expected]
 
 
 @pytest.mark.parametrize(
@@ -101,17 +102,20 @@ def test_breaks_of_more_than_12_h_are_given_as_the_error_advises() -> None:
 
 
 def test_a_daily_night_break_covers_the_begin_of_the_shift() -> None:
-    days = ["monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday"]
-    entry = {"name": "night", "begin": "22:00", "end": "6:00", "weekdays": days}
-    found = hours(with_breaks(entry, shift_begin="2026-11-23T05:00Z", horizon_s=30 * HOUR_S))
-    assert found == [(-7.0, 1.0), (17.0, 25.0)]
+    entry = {"name": "night", "begin": "22:00", "end": "6:00"}
+    assert hours(with_breaks(entry, shift_begin="2026-11-23T05:00Z", horizon_s=30 * HOUR_S)) == [(-7, 1), (17, 25)]
 
 
-def test_a_break_without_weekdays_is_the_first_that_touches_the_shift() -> None:
+def test_a_break_between_times_of_day_recurs_every_day_without_weekdays_and_one_with_dates_does_not() -> None:
     begin = {"shift_begin": "2026-03-28T20:00", "time_zone": "Europe/Berlin", "horizon_s": 30 * HOUR_S}
-    entries = [("19:30", "20:30"), ("19:00", "20:00"), ("23:00", "24:00")]
-    found = hours(with_breaks(*({"name": a, "begin": a, "end": b} for a, b in entries), **begin))
-    assert found == [(-0.5, 0.5), (22.0, 23.0), (3.0, 4.0)]
+    spans = {
+        ("19:30", "20:30"): [(-0.5, 0.5), (22.5, 23.5)],
+        ("19:00", "20:00"): [(22.0, 23.0)],
+        ("23:00", "24:00"): [(3.0, 4.0), (26.0, 27.0)],
+        ("2026-03-28T23:00", "2026-03-29T00:00"): [(3.0, 4.0)],
+    }
+    for (first, last), expected in spans.items():
+        assert hours(with_breaks({"name": "tea", "begin": first, "end": last}, **begin)) == expected
 
 
 def test_a_break_may_be_a_whole_day_or_within_the_hour_that_summer_time_leaves_out() -> None:
@@ -188,12 +192,12 @@ BREAK = {"name": "lunch", "begin": "4:00", "end": "5:00"}
         (
             {"breaks": [BREAK | {"begin": "11:30", "end": "11:00"}], "shift_begin": "2026-11-23T06:00Z"},
             r"breaks\[0\]: 11:30 to 11:00 lasts 23.5 h over midnight, but at most 12 h are taken: are begin and end "
-            r"exchanged\? Give a longer break with dates\.",
+            r"exchanged\? Give a longer break as two, to 24:00 and from 0:00 on the next days, or with dates for a",
         ),
         (
             {"breaks": [BREAK | {"begin": "14:00", "end": "6:00", "weekdays": ["monday"]}],
              "shift_begin": "2026-11-23T06:00Z"},
-            r"14:00 to 6:00 lasts 16 h .* Give a longer break as two, to 24:00 and from 0:00 on the next days\.",
+            r"14:00 to 6:00 lasts 16 h .* Give a longer break as two, to 24:00 and from 0:00 on the next days, or",
         ),
         (
             {"breaks": [BREAK | {"begin": "9:00", "end": "9:00"}], "shift_begin": "2026-11-23T06:00Z"},

@@ -252,7 +252,7 @@ ERRORS = {
     "x,hold,bench,,,60,30,,,": "column due: must not be before the release at 60 s (got 30 s).",
     "x,hold,bench,,,4:50,4:10,,,": "column due: must not be before the release at 4:50 (got 4:10).",
     "x,hold,bench,,,0:01:30,60,,,": "column due: must not be before the release at 0:01:30 (got 60 s).",
-    "x,hold,bench,,,,,yes,,": "column due: a hard due date needs a time.",
+    "x,hold,bench,,,,,yes,,": "column due: is missing: a hard due date needs a time.",
     "x,hold,bench,,,,,maybe,,": "column hard: expected yes or no (got 'maybe').",
     "x,hold,bench,,,,,,,y": "column after: there is no job 'y' in this table.",
     'x,hold,bench,,,,,,,"y;g"': "column after: there is no job 'y;g' in this table; give | between names.",

@@ -116,7 +116,7 @@ WRONG = [
     (put("jobs", 0, "places", [["bench"], ["bench"]]), "jobs[0].places must name each alternative once (got [('bench"),
     (put("jobs", 0, "places", [["bench"], ["shlf"]]), "jobs[0].places: no place 'shlf'; did you mean 'shelf'?"),
     (put("jobs", 1, "places", [["bench", "shelf"], []]), "two different places, from and to, for a sort (got none)."),
-    (put("jobs", 0, "force_n", 3), "jobs[0].force_n: only a press has a contact force (got 3.0 N)."),
+    (put("jobs", 0, "force_n", 3), "jobs[0].force_n must be 0 or left out: only a press has a contact force (got 3 N"),
     (put("jobs", 0, "repetitions", [5, 2]), "jobs[0].repetitions must be [fewest, most] (got 5, 2)."),
     (put("jobs", 0, "repetitions", [1, 10**30]), "jobs[0].repetitions must be between 1 and 100000 (got 1"),
     (put("jobs", 0, "after", ["hold"]), "jobs[0].after: there is no stream 'hold' above this one."),
@@ -541,8 +541,8 @@ def test_the_hour_that_occurs_twice_has_its_zone():
     assert "3 at Sun 25 Oct 02:15 CEST, Sun 25 Oct 02:15 CET, Sun 25 Oct 03:15" in told
 
 
-def test_names_in_the_picture_of_a_long_row_cover_no_other_name_and_arms_come_first(tmp_path, monkeypatch) -> None:
-    """30 arms and 60 places in a row of 19 m: all arms have their names, and some of the places."""
+def test_names_in_the_picture_of_a_long_row_cover_no_other_name_or_have_numbers(tmp_path, monkeypatch) -> None:
+    """30 arms and 60 places in a row of 19 m: all arms have their names, and the places names or numbers."""
     xs_m = np.linspace(-9.5, 9.5, 30).tolist()
     arms = [arm(f"arm_{n}", x, 0.0, 90.0) for n, x in enumerate(xs_m)]
     places = {f"left_{n}": (x - 0.12, 0.45, 0.25) for n, x in enumerate(xs_m)}
@@ -562,7 +562,12 @@ def test_names_in_the_picture_of_a_long_row_cover_no_other_name_and_arms_come_fi
     assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
     names = [note.get_text() for note in notes]
     assert {each.name for each in scenario.arms} <= {*names}
-    assert 30 < len(names) < 90
+    (key,) = (text.get_text() for text in figures[0].texts if text.get_text())
+    below = dict(reversed(each.split(" ")) for each in key.replace("\n", " ").split(", "))
+    at_m = {place.name: place.position_m[:2] for place in scenario.places}
+    assert {*names} == {*at_m, *(each.name for each in scenario.arms)} - {*below} | {*below.values()}
+    assert 0 < len(below) < 60
+    assert all(note.xy == at_m[name] for note in notes for name, number in below.items() if note.get_text() == number)
 
 
 @pytest.mark.filterwarnings("error")  # matplotlib's, that the names leave no room for the figure

@@ -67,7 +67,9 @@ def test_no_fault_in_ten_shifts_is_not_no_fault():
     assert none.note == "none in 10, Poisson"
     both = paired_counts(np.zeros(10), np.zeros(10))
     assert (both.low, both.high, both.p) == (-none.high, none.high, 1.0)
-    assert count_interval(np.zeros((3, 2, 20))).high == pytest.approx(3.689 / 3, abs=0.001)
+    for size in ((3, 2, 20), (1, 3, 20), (20, 1, 3)):
+        assert count_interval(np.zeros(size)).high == pytest.approx(3.689 / 3, abs=0.001)
+        assert interval(np.ones(size)).note == "no variation in 3"
     some = np.array([0.0, 1.0, 0.0, 3.0])
     assert count_interval(some) == interval(some, least=0.0)
     assert paired_counts(some, np.zeros(4)) == paired(some, np.zeros(4))
@@ -78,6 +80,15 @@ def test_counts_are_covered(mean):
     rng = np.random.default_rng(1)
     found = [count_interval(rng.poisson(mean, 10)) for _ in range(300)]
     assert np.mean([each.low <= mean <= each.high for each in found if not np.isnan(each.low)]) >= 0.94
+
+
+@pytest.mark.parametrize("size", [(1, 3, 20), (3, 1, 20), (3, 2, 20), (20, 1, 3)])
+def test_rare_counts_are_covered_if_some_fleets_trainings_or_seeds_alone_have_events(size):
+    """Each cluster of the scarcer kind has one event per shift with probability q, or none: the mean is q."""
+    rng, q = np.random.default_rng(3), 0.2
+    clusters = tuple(count if count == 3 else 1 for count in size)
+    intervals = [count_interval(rng.poisson(np.broadcast_to(rng.random(clusters) < q, size))) for _ in range(1000)]
+    assert np.mean([each.low <= q <= each.high for each in intervals]) >= 0.94
 
 
 def test_bad_values_and_scores_are_refused() -> None:

@@ -20,6 +20,7 @@ from scenarios.show.page import Head, Section
 from scenarios.show.page import Page as Report
 from scenarios.show.plan import plan_page
 from scenarios.show.run_page import runs_page
+from scenarios.show.twin_report import panels
 from scenarios.spec.load import load
 from scenarios.table import Table
 
@@ -197,6 +198,32 @@ def test_a_narrow_table_of_figures_keeps_the_names_of_its_rows_and_tiles_wrap(op
     page = open_page(report.html(), ".figures dd", viewport=NARROW)
     assert page.get_by_role("cell", name="predictions").evaluate(HEIGHT_OF_TEXT) < 30  # one line
     assert overflow_px(page) <= 0
+
+
+def test_panels_of_a_narrow_page_cover_no_other_panel_and_scroll_in_their_box(open_page) -> None:
+    """Labels with four decimals of four panels, each with a y axis of its own, as of the error by epochs."""
+    lines = [
+        {"type": "scatter", "x": ["untrained", "2"], "y": [0.7975 + 0.01 * n, 0.799], "name": "a"} for n in range(4)
+    ]
+    cells = {(0, n): [line] for n, line in enumerate(lines)}
+    charts = panels("epochs", cells, x="epochs", y=("mean |error| (σ)",), heads=("a", "b", "c", "d"))
+    origin = Table(head=("", ""), rows=(("thermofleet", "0.1.0 " * 20),), numbers=False)
+    report = Report(title="a", sections=[Section(charts=charts)], origin=origin)
+    page = open_page(report.html(), ".chart .ytick text", viewport=NARROW)
+    assert overflow_px(page) <= 0
+    plots = [box for each in page.locator(".draglayer .nsewdrag").all() if (box := each.bounding_box())]
+    texts = page.locator('[class^="y"][class$="tick"] text, .g-ytitle text').all()
+    labels = [box for each in texts if (box := each.bounding_box())]
+    assert len(plots) == 4
+    assert len(labels) > 8
+    for number, one in enumerate(labels):
+        for other in (*plots, *labels[number + 1 :]):
+            apart = (
+                max(one[axis], other[axis]) - min(one[axis] + one[size], other[axis] + other[size])
+                for axis, size in (("x", "width"), ("y", "height"))
+            )
+            assert max(apart) > -0.5, (one, other)  # px
+    assert page.get_by_role("cell", name="thermofleet").evaluate(HEIGHT_OF_TEXT) < 30  # one line
 
 
 def luminance(rgb: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -17,6 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet.errors import FleetError
+from fleet.events import Event
 from fleet.ros2.cdr import read, read_diagnostics, read_joints
 from fleet.telemetry import MODES, Telemetry
 from scenarios.run.log import RunLog, open_run, telemetry_table
@@ -233,6 +235,19 @@ def along(parents: dict[str, str], poses: dict[str, tuple[list[float], list[floa
         mujoco.mju_rotVecQuat(turned, point, np.array(quaternion))
         point, frame = turned + position, parents[frame]
     return point
+
+
+def test_a_break_of_several_arms_is_one_line_of_the_log_of_a_file(run: RunLog) -> None:
+    events = [Event(time_s=60.0, kind="break", arm=arm, reason="tea") for arm in run.arms[:3]]
+    events += [Event(time_s=90.0, kind="break_end", arm=arm, reason="tea") for arm in run.arms[:3]]
+    other = Event(time_s=75.0, kind="break", arm=run.arms[3], reason="service")
+    lines = list(Moments(replace(run, events=(*events, other), offers=())).log())
+    first, second, third, fourth = run.arms
+    assert [(line.time_s, line.arm, line.text) for line in lines] == [
+        (60.0, f"{first}, {second} and {third}", "break: tea"),
+        (75.0, fourth, "break: service"),
+        (90.0, f"{first}, {second} and {third}", "break end: tea"),
+    ]
 
 
 @pytest.mark.ci_slow

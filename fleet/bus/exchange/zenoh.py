@@ -102,13 +102,15 @@ class ZenohExchange(Exchange):
         with ExitStack() as stack:
             endpoint = self._endpoint or stack.enter_context(Router()).endpoint
             client = stack.enter_context(BusClient(endpoint, self._fleet, timeout_s=self._timeout_s))
-            present = client.tokens(keys.of_every_arm(self._fleet, "alive"))
+            of_arms = keys.of_every_arm(self._fleet, "alive")
+            present = client.tokens(of_arms)
             if taken := sorted(present & set(self.arms)):
                 raise BusError(f"Fleet '{self._fleet}' already has {', '.join(taken)} on the bus at {endpoint}.")
             try:
                 self._publishers = [_ArmPublishers(client, arm) for arm in self.arms]
             except zenoh.ZError as error:
                 raise BusError(f"The bus at {endpoint} could not be opened: {error}") from error
+            client.tokens(of_arms)  # replied in order: the router has the tokens, and the next to ask gets them
             self._endpoint, self._resources = endpoint, stack.pop_all()
         return self
 

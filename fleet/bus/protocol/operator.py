@@ -7,7 +7,7 @@ import msgspec
 from fleet.bus.protocol.auction import JobSpec, JobStatus
 from fleet.bus.protocol.messages import Count, FiniteStruct, MalformedMessage, Name, Number, Person, PersonRequest
 from fleet.errors import check_names
-from fleet.job import check_bounds
+from fleet.job import check_bounds, check_force, check_hard_due
 
 MAX_REQUEST_NAME = 64
 """Characters of the name of a request."""
@@ -147,11 +147,11 @@ def check_request(request: msgspec.Struct) -> None:
 
 def _check_new(job: JobSpec) -> None:
     """Check what only new jobs must have; raises ValueError."""
-    if job.force_n and job.kind != "press":
-        got = f"(got {job.force_n:g} N for the {job.kind} '{job.name}')"
-        raise ValueError(f"JobSpec.force_n must be 0 or left out: only a press has a contact force {got}.")
-    if job.expires and job.due_s is None:
-        raise ValueError(f"JobSpec.expires needs due_s, the hard due date (got none for '{job.name}').")
+    try:
+        check_force(job, job.kind, job.force_n)
+        check_hard_due(job, job.expires, job.due_s)
+    except ValueError as error:
+        raise ValueError(f"Job '{job.name}': {error}") from error
 
 
 class ResetRequest(PersonRequest, frozen=True):

@@ -131,6 +131,10 @@ class Granter:
         expire(self.book, real_s, time_s)
         return clear(self.book, arm, by, present, self.timing.lease_s, time_s)
 
+    def granted_to(self, arm: str) -> set[str]:
+        """Return the awards of an arm that this one has granted and that have not ended."""
+        return {award for award, grant in self.book.open.items() if grant.record.arm == arm}
+
     def in_the_way(self, arm: str, space: str | None) -> tuple[str, ...]:
         """Return the arms that take a space which excludes this one of an arm."""
         return arms_in_the_way(arm, space, self.book.taken_space(), self._excludes)

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from fleet.bus.client import AnotherReplies, Replies
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import JobStatus, LeaseRequest, Report, Submission, SubmissionReply
+from fleet.bus.protocol.auction import Clock, ClockRequest, JobStatus, LeaseRequest, Report, Submission, SubmissionReply
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply, History, HistoryRequest
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
@@ -317,18 +317,24 @@ class ConsensusNode(JobDesk):
     def _answer_claim(self, claim: Claim) -> ClaimReply:
         if claim.arm == self._name or not (self._begun and self._joined):
             raise AnotherReplies
-        return self.participant.granter.answer_claim(claim, time.monotonic())
+        real_s = time.monotonic()
+        self.book.pass_time(self._arm.clock.now_s(real_s))
+        return self.participant.granter.answer_claim(claim, real_s)
 
     # Requests of others: all arms receive them, and the first present one replies
 
     def _check_first(self) -> None:
-        """Check that this arm replies for the fleet.
+        """Check that this arm replies for the fleet, which has begun or lacks a majority.
 
         Raises:
-            AnotherReplies: another arm does.
+            AnotherReplies: another arm does, or all of them once they have begun.
         """
-        if not self._begun or self._name != min(self._present, default=self._name):
+        if not (self._begun or self._lacks_majority) or self._name != min(self._present, default=self._name):
             raise AnotherReplies
+
+    @property
+    def _lacks_majority(self) -> bool:
+        return len(self._present | {self._name}) < self._majority
 
     @property
     def _present(self) -> frozenset[str]:
@@ -339,12 +345,19 @@ class ConsensusNode(JobDesk):
 
     @property
     def time_s(self) -> float:
-        """Fleet time."""
-        return self._arm.clock.now_s(time.monotonic())
+        """Fleet time; before it goes on, that of the journal."""
+        return self._arm.clock.now_s(time.monotonic()) if self._begun else self.book.time_s
+
+    def _reply_clock(self, _: ClockRequest) -> Clock:
+        if not self._begun:
+            raise AnotherReplies
+        return super()._reply_clock(_)
 
     def _trouble(self) -> str:
-        failure = self._recorder.failure
-        return f"{self._name} accepts and takes no jobs: {failure}" if failure else ""
+        if failure := self._recorder.failure:
+            return f"{self._name} accepts and takes no jobs: {failure}"
+        present, roster = self._present | {self._name}, self.participant.granter.roster
+        return TOO_FEW.format(len(present), len(roster), self._majority) if self._lacks_majority else ""
 
     def _entries(self) -> list[JobEntry]:
         return self.participant.entries(job for _, job in self._stream)
@@ -353,9 +366,9 @@ class ConsensusNode(JobDesk):
         return self.participant.status_of(entries, time.monotonic())
 
     def _submit(self, submission: Submission) -> SubmissionReply:
-        if len(self._present | {self._name}) < self._majority:  # the others may accept another job of the same name
+        if self._lacks_majority:  # the others may accept another job of the same name
             self._check_first()
-            raise RefusedForNow(f"{TOO_FEW.format(self._majority)} Submit it again then.")
+            raise RefusedForNow(f"{self._trouble()} Submit it again then.")
         later = {job.name: job for _, job in self._stream}
         admissions = self.book.admit(submission.jobs, self.time_s, later)
         accepted = [job for job, reply in zip(submission.jobs, admissions, strict=True) if reply.accepted]
@@ -375,6 +388,8 @@ class ConsensusNode(JobDesk):
 
     def _control(self, request: ControlRequest) -> Controlled:
         self._check_first()
+        if not self._begun:
+            raise RefusedForNow(f"{self._trouble()} Ask again then.")
         return self.participant.control(request, self.time_s, (job for _, job in self._stream))
 
     # Messages to send

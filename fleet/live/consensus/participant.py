@@ -52,7 +52,7 @@ QUIET_S = 0.05
 """Real seconds without a new bid or choice, after which all arms most likely have the same bids."""
 BID_S = 1.0
 """Real seconds between two bids in which only the costs differ."""
-TOO_FEW = "A majority of the arms, {}, must be present."
+TOO_FEW = "{} of {} arms present: a majority, {}, is needed."
 """Why no job is granted or accepted."""
 NO_CHOICE = Choice("")
 MAX_PAUSES = 4096
@@ -119,6 +119,8 @@ class Participant:
         self._number = boot * NUMBERS_PER_BOOT
         self._bids: dict[str, tuple[Bid, float]] = {}
         """Last bid of each arm, and its real second."""
+        self._granted: dict[str, set[str]] = {}
+        """Awards that this arm had granted to each arm when its last bid came."""
         self._present: frozenset[str] = frozenset()
         self._bid_s = self._chosen_s = self._changed_s = -math.inf
         self._waiting_s = math.inf
@@ -158,7 +160,7 @@ class Participant:
             return
         if before is not None and bid.number // NUMBERS_PER_BOOT > before[0].number // NUMBERS_PER_BOOT:
             self.claimant.repeat_for(bid.arm)
-        self._bids[bid.arm] = bid, real_s
+        self._bids[bid.arm], self._granted[bid.arm] = (bid, real_s), self.granter.granted_to(bid.arm)
         self._refusals.note(bid)
         if before is None or _offered(before[0]) != _offered(bid):
             self._changed_s, self._new_bids = real_s, True
@@ -212,6 +214,7 @@ class Participant:
     def tick(self, real_s: float, time_s: float) -> None:
         """Do what is due."""
         self._time_s = time_s
+        self.book.pass_time(time_s)
         self._obey(real_s)
         for job in self.claimant.rejected:
             self._lost = True
@@ -274,15 +277,15 @@ class Participant:
         bids = self._fresh_bids(real_s)
         offered = {offer.job for bid in bids.values() for offer in bid.estimates}
         bidding = self._bidding(bids, offered) if bids else None
-        fewer = len(self._present | {self.name}) < self.claimant.majority
+        present, roster, majority = self._present | {self.name}, self.granter.roster, self.claimant.majority
         busy, book = self.book.busy_stations(), self.book
 
         def why(job: JobSpec) -> str:
             not_ready = why_not_ready(job, self._time_s, book.is_finished, busy)
             if reason := self._refusal(job.name) or not_ready:
                 return reason
-            if fewer:
-                return TOO_FEW.format(self.claimant.majority)
+            if len(present) < majority:
+                return TOO_FEW.format(len(present), len(roster), majority)
             if bidding is None or job.name not in offered:
                 return NOT_OFFERED.format(self._slots)
             return reason_to_wait(bidding, job.name)
@@ -404,8 +407,12 @@ class Participant:
 
     def _bidding(self, bids: dict[str, Bid], names: Iterable[str]) -> Bidding:
         """Return the bids for some jobs as in a round of an auctioneer."""
-        quotes = {arm: self._sensors[arm].check_quote(_quote(bid, self.states.get(arm))) for arm, bid in bids.items()}
         book, paused = self.book, self.book.operations.paused
+        quotes: dict[str, Quote] = {}
+        for arm, bid in bids.items():
+            gained = self.granter.granted_to(arm) - self._granted[arm]
+            bid = replace(bid, capacity=max(0, bid.capacity - len(gained)))
+            quotes[arm] = self._sensors[arm].check_quote(_quote(bid, self.states.get(arm)))
         entries = [book.jobs[name] for name in dict.fromkeys(names) if name in book.jobs]
         unfit = {arm: why for arm in bids if (why := self._sensors[arm].why_unfit)}
         return Bidding(

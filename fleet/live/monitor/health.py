@@ -353,7 +353,7 @@ def check_auctioneers(fleet: FleetSnapshot, probes: Sequence[ClockProbe], wanted
     elif not wanted:
         unwanted = f"Auctioneer {listed} is present, though the fleet should have none."
         return [Finding("warning", unwanted)] if names else []
-    elif any(probe.time_s is not None for probe in probes):
+    elif any(probe.time_s is not None for probe in probes) or _is_without_auctioneer(fleet):
         return []
     elif names:
         problem = f"Auctioneer {listed} shows its token but does not answer: its process may hang."
@@ -363,6 +363,12 @@ def check_auctioneers(fleet: FleetSnapshot, probes: Sequence[ClockProbe], wanted
             "If this fleet needs none, give --no-auctioneer."
         )
     return [Finding("fault", problem)]
+
+
+def _is_without_auctioneer(fleet: FleetSnapshot) -> bool:
+    """Return whether an arm replies about the jobs, also before the fleet's time begins."""
+    last, age_s = fleet.last_reply
+    return age_s <= SILENT_S and any(arm.arm == last for arm in fleet.arms)
 
 
 def complaints_of_states(fleet: FleetSnapshot, complaints: Mapping[str, str]) -> dict[str, str]:
