@@ -107,6 +107,15 @@ class Disk:
             self.names[name].lose(self._rng)
         self._durable = dict(self.names)
 
+    def copy(self) -> dict[str, bytes]:
+        """Return the content of all files."""
+        return {name: bytes(file.data) for name, file in self.names.items()}
+
+    def restore(self, files: dict[str, bytes]) -> None:
+        """Replace all files by copies."""
+        self.names = {name: File(bytearray(content)) for name, content in files.items()}
+        self._durable = dict(self.names)
+
     def close_all(self) -> None:
         """Close what an ended process had open."""
         self._open.clear()

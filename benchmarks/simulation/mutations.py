@@ -15,14 +15,19 @@ from fleet.bus.protocol.operator import Cancel, Change, Operation, Pause, Resume
 from fleet.errors import Refused
 from fleet.live import steering as steering_module
 from fleet.live.arm.awards import ArmHistory, AwardAccepted, AwardExecutor, Closed
+from fleet.live.arm.node import ArmNode
 from fleet.live.auction import auctioneer as auctioneer_module
+from fleet.live.auction import node as auction_node_module
 from fleet.live.auction import rounds as round_module
 from fleet.live.auction.auctioneer import Auctioneer
+from fleet.live.auction.node import AuctionNode, EpochCheck
 from fleet.live.auction.rounds import Rounds
 from fleet.live.book import JobBook
 from fleet.live.consensus import grants as grants_module
+from fleet.live.consensus import node as consensus_node_module
 from fleet.live.consensus import participant as participant_module
 from fleet.live.consensus.grants import Claimant, Granter
+from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Participant
 from fleet.live.job_rules import PastJobs, content_hash
 from fleet.live.journal import CommitPermitted, JobsAccepted, Journal, Released
@@ -415,4 +420,49 @@ add_mutation(
     "repeats-recorded",
     "a message is recorded once",
     (Recorder, "_fill", lambda _: lambda self, series, count, time_s: True),
+)
+
+
+def _nothing(_: Any) -> Any:
+    return lambda *_, **__: None
+
+
+add_mutation(
+    "journals-unchecked",
+    "an arm takes part with the journals that its peers know",
+    (consensus_node_module, "check_journals", _nothing),
+    alone=True,
+)
+add_mutation(
+    "empty-journal",
+    "an auctioneer without its journal awards nothing to arms that know it",
+    (auction_node_module, "check_begin", _nothing),
+    (EpochCheck, "_accept", lambda _: lambda self, history: True),
+    alone=False,
+)
+add_mutation(
+    "history-ignored",
+    "an auctioneer adopts what arms have done and have",
+    (auctioneer_module, "adopted", lambda _: lambda book, history: []),
+    alone=False,
+)
+add_mutation(
+    "history-not-awaited",
+    "after a restart no job is awarded before the arms reply",
+    (EpochCheck, "awaited", lambda _: lambda self, arms: frozenset()),
+    alone=False,
+)
+add_mutation(
+    "two-auctioneers",
+    "a second auctioneer is refused, or both award nothing",
+    (AuctionNode, "_check_no_auctioneer", _nothing),
+    (AuctionNode, "_set_rival", _nothing),
+    alone=False,
+)
+add_mutation("break-ignored", "an arm takes no job in a break", (ArmNode, "_keep_breaks", _nothing))
+add_mutation(
+    "no-end",
+    "no job is begun after the end of the shift",
+    (AuctionNode, "end", _nothing),
+    (ConsensusNode, "_end", _nothing),
 )

@@ -19,6 +19,7 @@ from benchmarks.simulation.disk import Disk, DiskPath, SimulatedConnection, Sqli
 from benchmarks.simulation.machine import Deeds, SimulatedArm, SimulatedEstimator
 from benchmarks.simulation.recording import simulated_files
 from benchmarks.simulation.world import Process, World
+from fleet.breaks import Break
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobSpec, Submission, SubmissionReply
 from fleet.errors import BusError
@@ -56,18 +57,29 @@ class ArmProcess:
         machine: Its machine since the last start.
         unsure: Jobs that it returned at a start without knowing whether the last cycle was done.
         new_epoch: Whether it begins without the journals that its peers know.
+        breaks: Its breaks.
+        first_number: Number after which the claims of its last start are counted; None without an auctioneer before.
     """
 
     def __init__(
         self, deeds: Deeds, first: str, speed: float, rate_hz: float, capacity: int, membership: Membership | None
     ) -> None:
         self._deeds, self._first, self._speed, self._rate_hz = deeds, first, speed, rate_hz
-        self._capacity, self._membership = capacity, membership
+        self._capacity, self.membership = capacity, membership
         self.machine: SimulatedArm | None = None
         self.unsure: set[str] = set()
         self.new_epoch = False
+        self.breaks: tuple[Break, ...] = ()
+        self.first_number: int | None = None
+        self._kept: ArmHistory | None = None
+
+    @property
+    def epoch(self) -> str:
+        """Epoch that it knows with an auctioneer, since its last start."""
+        return "" if self._kept is None else self._kept.epoch
 
     def __call__(self, process: Process) -> ArmNode:
+        self.first_number = None
         link: Any = SimulatedClient(process)
         name = process.name
         journal = _journal(process, "awards", ArmRecord)
@@ -77,26 +89,24 @@ class ArmProcess:
         history = restart_history(journal, name, clock.now_s(process.real_s))
         self.unsure |= {report.job for _, report in history.reports.values() if report.unsure}
         config = ExecutorConfig(capacity=self._capacity)
-        kept = ArmHistory().replay(history.compact())
+        kept = self._kept = ArmHistory().replay(history.compact())
         keep = CompactingJournal(journal, kept).append
         executor = AwardExecutor(name, keep, history, nonce=f"{process.boot}", config=config)
         self._deeds.is_home(name)  # a person moves it home before it is started
         self.machine = SimulatedArm(name, self._deeds, clock.now_s(process.real_s))
         body: Any = self.machine
         estimator: Any = SimulatedEstimator(name, self._first)
-        settings = ArmConfig(warning_c=80.0, rate_hz=self._rate_hz, boot=history.boot)
-        if self._membership is None:
+        settings = ArmConfig(warning_c=80.0, rate_hz=self._rate_hz, boot=history.boot, breaks=self.breaks)
+        if self.membership is None:
             return ArmNode(link, body, executor, estimator, clock, settings, partial(AuctioneerClient, history=kept))
-        grants, membership = _journal(process, "grants", BookRecord), self._membership
-        return ArmNode(
-            link,
-            body,
-            executor,
-            estimator,
-            clock,
-            settings,
-            lambda arm: ConsensusNode(arm, membership, grants, boot=history.boot, new_epoch=self.new_epoch),
-        )
+        grants, membership = _journal(process, "grants", BookRecord), self.membership
+
+        def join(arm: ArmNode) -> ConsensusNode:
+            node = ConsensusNode(arm, membership, grants, boot=history.boot, new_epoch=self.new_epoch)
+            self.first_number = node.participant._number
+            return node
+
+        return ArmNode(link, body, executor, estimator, clock, settings, join)
 
 
 def auctioneer_process(

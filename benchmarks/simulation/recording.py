@@ -23,7 +23,7 @@ from benchmarks.simulation.bus import Bus, Published, SimulatedClient
 from benchmarks.simulation.disk import DiskCalls
 from benchmarks.simulation.world import Process, Violation
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import ArmEvent, Result
+from fleet.bus.protocol.auction import ABANDONED, ArmEvent, Result
 from fleet.bus.protocol.operator import Operation
 from fleet.events import EVENTS_PER_BOOT
 from scenarios.live import recorder as recorder_module
@@ -78,10 +78,17 @@ def simulated_files(disk: Callable[[], Any]) -> Iterator[None]:
 
 
 class Sent:
-    """What was published, by kind, sender and number, and where it may be cached."""
+    """What was published, by kind, sender and number, and where it may be cached.
+
+    Attributes:
+        renumbered: Senders that have lost their journals, and used numbers again: their recording is not checked.
+        abandoned: Jobs that were reported as abandoned.
+    """
 
     def __init__(self, bus: Bus) -> None:
         self.messages: dict[tuple[Kind, str, Number], msgspec.Struct] = {}
+        self.renumbered: set[str] = set()
+        self.abandoned: set[str] = set()
         self.cached: dict[str, Any] = {}
         bus.on_publish = self._add
 
@@ -95,18 +102,30 @@ class Sent:
         else:
             return
         self.cached[published.key] = published
-        if self.messages.setdefault(key, message) != message:
+        if isinstance(message, Result) and message.status.state in ABANDONED:
+            self.abandoned.add(message.status.job)
+        if key[1] in self.renumbered:
+            self.messages[key] = message
+        elif self.messages.setdefault(key, message) != message:
             raise Violation(f"Two messages have the number {key}.")
+
+    def renumber(self, sender: str) -> None:
+        """Drop what a participant has published, as it may use the numbers again."""
+        self.renumbered.add(sender)
+        self.messages = {key: message for key, message in self.messages.items() if key[1] != sender}
 
     def missing(self, node: RecorderNode | None) -> list[str]:
         """Return what a recorder has yet to get, in words."""
         if node is None:
             return ["it is down"]
         recorder = node.recorder
-        seeks = [f"'{gap.sender}' is sought from {gap.first} to {gap.last}" for gap in recorder.missing]
-        numbered = sorted((kind, name, number) for kind, name, number in self.messages if isinstance(number, int))
+        checked = [key for key in self.messages if key[1] not in self.renumbered]
+        gaps = (gap for gap in recorder.missing if gap.sender.partition(" of ")[2] not in self.renumbered)
+        seeks = [f"'{gap.sender}' is sought from {gap.first} to {gap.last}" for gap in gaps]
+        numbered = sorted((kind, name, number) for kind, name, number in checked if isinstance(number, int))
         last = {f"{kind} of {name}": number for kind, name, number in numbered if kind != "events"}
-        last |= {f"events of {own.name}": own.cache[-1][1].number for own in self.cached.values() if _has_events(own)}
+        with_events = [own for own in self.cached.values() if _has_events(own) and own.name not in self.renumbered]
+        last |= {f"events of {own.name}": own.cache[-1][1].number for own in with_events}
         heard = {name.partition(", epoch")[0]: count.last for name, count in recorder.counts.items()}
         seeks += [f"'{name}' {number}" for name, number in last.items() if heard.get(name) != number]
         kept = {(name, request) for name, count in recorder.counts.items() for _, request in count.requests}
@@ -127,7 +146,7 @@ class Sent:
                 raise Violation("The recording is not ended.")
             gaps = [(*row["sender"].split(" of "), row) for row in read_parts(folder, "gaps").to_pylist()]
             for kind, name in NAMES.items():
-                rows = read_parts(folder, kind).to_pylist()
+                rows = [row for row in read_parts(folder, kind).to_pylist() if row[name] not in self.renumbered]
                 self._check_kind(kind, rows, name)
                 lost: set[tuple[str, Number]] = {
                     (of, n) for what, of, row in gaps if what == kind for n in range(row["first"], row["last"] + 1)
@@ -140,7 +159,7 @@ class Sent:
         return {
             (kinds[keys.parse(published.key).topic], published.name, _number_of(published.key, message))
             for published in self.cached.values()
-            if published.client.open_
+            if published.client.open_ and published.name not in self.renumbered
             for _, message in published.cache
         }
 
@@ -169,7 +188,7 @@ class Sent:
                 boot = (of, number // EVENTS_PER_BOOT)
                 last[boot] = max(last.get(boot, -1), number)
         for what, of, number in self.messages:
-            if what != kind or (of, number) in kept or (of, number) in lost:
+            if what != kind or of in self.renumbered or (of, number) in kept or (of, number) in lost:
                 continue
             noticed = isinstance(number, int) and (
                 kind != "events" or number < last.get((of, number // EVENTS_PER_BOOT), -1)

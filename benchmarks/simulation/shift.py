@@ -10,13 +10,14 @@ result once (`recording`).
 from collections.abc import Mapping
 from typing import Any
 
+from benchmarks.simulation.maintenance import LAST_DIGITS, Maintenance
 from benchmarks.simulation.participants import AUCTIONEER, CLIENT, Watch, simulated_system
 from benchmarks.simulation.recording import RECORDER
 from benchmarks.simulation.simulated_fleet import FIRST, Fleet, random_conflicts
 from benchmarks.simulation.steering import check_steering
 from benchmarks.simulation.world import Process, Violation, World
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import ABANDONED, SETTLED, JobSpec, Result
+from fleet.bus.protocol.auction import ABANDONED, SETTLED, JobSpec
 from fleet.bus.protocol.operator import (
     ALL_ARMS,
     Action,
@@ -30,7 +31,6 @@ from fleet.bus.protocol.operator import (
 )
 from fleet.job import reason_to_give_up
 from fleet.live.leases import Timing
-from scenarios.live.arm import RETIRE_S
 
 LONGEST_WRITES = 60
 """Changing disk calls until a planned crash, at most."""
@@ -70,8 +70,6 @@ class Shift(Fleet):
         self.faults: dict[str, list[str]] = {}
         self.cancelled: set[str] = set()
         """Jobs that a person has asked to cancel."""
-        self.redone: set[str] = set()
-        """Jobs that a person has asked to redo before their last cycle was begun."""
         self.broken_off: set[str] = set()
         """Jobs of which an arm broke the last cycle off."""
         self.requests = 0
@@ -83,6 +81,7 @@ class Shift(Fleet):
         rate_hz, capacity = rng.choice([0.5, 1.0]), rng.choice([1, 1, 2])
         options: dict[str, Any] = {"rate_hz": rate_hz, "capacity": capacity}
         super().__init__(world, arms, alone=alone, speed=speed, excludes=excludes, timing=timing, **options)
+        self.maintenance = Maintenance(self, seed) if seed % 10 in LAST_DIGITS else None
 
     def run(self) -> None:
         """Live through faults, heal, and settle.
@@ -94,7 +93,7 @@ class Shift(Fleet):
         with simulated_system(world):
             world.log("shift", f"{len(self.arms)} arms, speed {self.speed:g}, {'alone' if self.alone else AUCTIONEER}")
             world.processes[CLIENT].start()
-            self.watch = Watch(world, self.names)
+            self.watch = Watch(world, self.all_names)
             at_s = 3.0
             while at_s < self.faulty_s:
                 world.at(at_s, self._submit)
@@ -103,11 +102,19 @@ class Shift(Fleet):
             while at_s < self.faulty_s:
                 world.at(at_s, self._fault)
                 at_s += rng.expovariate(1.0 / self.fault_gap_s)
+            if self.maintenance is not None:
+                self.maintenance.plan(self.faulty_s)
             world.run(self.faulty_s)
             heal(self)
             self._settle()
             self._check_space()
             self._end_recording()
+
+    def departs(self, arm: str, space: str) -> None:
+        """Check as a fleet does, and that the arm may leave home now."""
+        super().departs(arm, space)
+        if self.maintenance is not None:
+            self.maintenance.check_departure(arm)
 
     def begins_last_cycle(self, arm: str, job: str) -> None:
         """Check as a fleet does. The arm breaks down if a person has asked to redo the job.
@@ -127,6 +134,11 @@ class Shift(Fleet):
         """Note that a last cycle was certainly not done."""
         super().breaks_last_cycle_off(arm, job)
         self.broken_off.add(job)
+
+    def _after_exit(self, process: Process) -> None:
+        super()._after_exit(process)
+        if self.maintenance is not None and process.name in (AUCTIONEER, *self.builders):
+            self.maintenance.keep_copy(process)
 
     def _submit(self) -> None:
         rng, names = self.rng, [job.name for job in self.jobs]
@@ -164,7 +176,19 @@ class Shift(Fleet):
             if status.state == "waiting" and not status.reason:
                 raise Violation(f"'{status.job}' waits, and nothing says why.")
 
+    def end_faults(self) -> None:
+        """End all faults; the network stays as slow as it is."""
+        super().end_faults()
+        self.watch.log.full = False
+
+    @property
+    def is_quiet(self) -> bool:
+        """Whether no faults begin."""
+        return self.healed or self.world.now_s < self.quiet_until_s
+
     def _fault(self) -> None:
+        if self.is_quiet:
+            return
         fault = self.rng.choice(self.possible)
         self.world.log("fault", fault.__name__)
         fault(self)
@@ -266,16 +290,16 @@ class Shift(Fleet):
         self._wait_until_settled()
         self.unsure |= {job for builder in self.builders.values() for job in builder.unsure}
         states = self.statuses()
-        results = [each.status for each in self.sent.messages.values() if isinstance(each, Result)]
         # A job that was given up may be finished after all, when those that wait for it have left already.
-        abandoned = {status.job for status in results if status.state in ABANDONED}
+        abandoned = self.sent.abandoned
         for name, job in self.submitter.accepted.items():
             state, done = states[name], self.finished.get(name, 0)
             if state == "finished" and done != 1:
                 raise Violation(f"'{name}' is called finished, and was done {done} times.")
             if done and state != "finished" and name not in self.unsure:
                 raise Violation(f"'{name}' was done, and is called {state}.")
-            if state == "unfinished" and name not in self.unsure and not self._lacks_permission(name):
+            unsure = name in self.unsure | self.doubtful or (self.maintenance is not None and self.maintenance.ends)
+            if state == "unfinished" and not unsure and not self._lacks_permission(name):
                 raise Violation(f"'{name}' is unfinished, and no arm stopped in its last cycle.")
             if state == "cancelled" and name not in self.cancelled:
                 raise Violation(f"'{name}' is cancelled, and nobody asked for it.")
@@ -435,7 +459,7 @@ def swizzle(shift: Shift) -> None:
 
 
 def _isolate(shift: Shift, name: str, group: int) -> None:
-    if shift.healed:
+    if shift.is_quiet:
         return
     groups = {process.name: process.group for process in shift.world.processes.values()} | {name: group}
     shift.world.split({name: group for name, group in groups.items() if group})
@@ -447,7 +471,7 @@ def lose_router(shift: Shift) -> None:
 
 
 def _cut(shift: Shift, group: dict[str, int], seconds: float) -> None:
-    if shift.healed:
+    if shift.is_quiet:
         return
     shift.world.split(group)
     shift.world.after(seconds * shift.rng.uniform(0.7, 1.3), shift.world.split, {})
@@ -458,12 +482,7 @@ def lose_messages(shift: Shift) -> None:
     world, rng = shift.world, shift.rng
     world.loss, world.doubling = rng.choice([0.0, 0.05, 0.3, 0.7]), rng.choice([0.0, 0.05, 0.3])
     world.slow = rng.choice([1.0, 3.0, 30.0])
-    world.after(rng.uniform(1.0, 30.0), calm, shift)
-
-
-def calm(shift: Shift) -> None:
-    """End the loss of messages."""
-    shift.world.loss, shift.world.doubling, shift.world.slow = 0.0, 0.0, 1.0
+    world.after(rng.uniform(1.0, 30.0), world.calm)
 
 
 def overheat(shift: Shift) -> None:
@@ -486,7 +505,7 @@ def _break_down(shift: Shift, process: Process) -> None:
     process.broken = True
     process.kill("breaks down")
     shift.world.after(shift.rng.uniform(3.0, 15.0), clear, shift, process.name)
-    shift.world.after(shift.rng.uniform(20.0, 60.0), setattr, process, "broken", False)
+    shift.world.after(shift.rng.uniform(20.0, 60.0), shift.repair, process)
 
 
 def move_home(shift: Shift) -> None:
@@ -565,16 +584,7 @@ def request(shift: Shift, action: Action) -> None:
 
 def stop_politely(shift: Shift) -> None:
     """Stop an arm at work as by SIGTERM: its process retires, and exits soon after."""
-    process = _arm(shift, busy=True)
-    node: Any = process.node
-    if node is not None and not process.paused:
-        process._call(lambda: node.retire(process.real_s))
-        shift.world.after(RETIRE_S, _exit, process, process.boot)
-
-
-def _exit(process: Process, boot: int) -> None:
-    if process.boot == boot:
-        process.kill("exits")
+    shift.retire(_arm(shift, busy=True))
 
 
 def kill_supervisor(shift: Shift) -> None:
@@ -592,12 +602,7 @@ FAULTS = (
 
 
 def heal(shift: Shift) -> None:
-    """End all faults; the network stays as slow as it is."""
-    calm(shift)
+    """End all faults."""
     shift.healed = True
-    shift.world.split({})
-    shift.watch.log.full = False
-    for process in shift.world.processes.values():
-        process.disk.full, process.disk.broken, process.disk.crash_in, process.broken = False, 0, 0, False
-        process._resume(process.boot)
+    shift.end_faults()
     shift.world.log("shift", "heals")

@@ -5,7 +5,9 @@ exclude each other; an accepted job stays known; whoever has granted an award ke
 ends.
 """
 
+import math
 from collections.abc import Mapping
+from functools import partial
 from random import Random
 from typing import Any
 
@@ -22,6 +24,7 @@ from fleet.live.consensus.participant import Choose, Membership
 from fleet.live.leases import Timing
 from fleet.live.space import ANYWHERE, Excludes
 from fleet.robot import ThermalLimits
+from scenarios.live.arm import RETIRE_S
 
 FIRST = "arm_0"
 """Can do every job."""
@@ -73,6 +76,10 @@ class Fleet:
         departed_s: True second at which an arm has left home last.
         unsure: Jobs whose arm stopped in the last cycle.
         sent: What the participants have published.
+        redone: Jobs that a person has asked to redo before their last cycle was begun.
+        quiet_until_s: True second up to which no faults begin.
+        forgetful_until_s: True second up to which an auctioneer may lack accepted jobs, which are submitted again.
+        doubtful: Jobs with permission to commit of which lost journals may have been the only record.
     """
 
     def __init__(
@@ -97,6 +104,11 @@ class Fleet:
         self.away: dict[str, str] = {}
         self.departed_s = 0.0
         self.unsure: set[str] = set()
+        self.redone: set[str] = set()
+        self.doubtful: set[str] = set()
+        self.quiet_until_s = self.forgetful_until_s = -math.inf
+        self._excused: set[tuple[str, str]] = set()
+        """Granters that have lost their journals, with the awards of that time."""
         membership: Membership | None = None
         if alone:
             live = LiveFleet(arms=arms, limits=ThermalLimits(warning_c=80.0, error_c=95.0))
@@ -105,12 +117,13 @@ class Fleet:
         self.builders = {name: ArmProcess(self, FIRST, speed, rate_hz, capacity, membership) for name in arms}
         for name in arms:
             Process(world, name, self.builders[name])
+        self._auctioneer = partial(auctioneer_process, speed=speed, allocate=allocate, timing=timing, excludes=excludes)
         if not alone:
-            Process(world, AUCTIONEER, auctioneer_process(arms, speed, allocate, timing, excludes))
+            Process(world, AUCTIONEER, self.auctioneer_builder())
         self.sent = Sent(world.bus)
         Process(world, RECORDER, recorder_process(world.rng.choice([5.0, 20.0, 60.0])))
-        self.names = tuple(world.processes)
-        """Processes of the fleet; the client is not one of them."""
+        self.names = self.all_names = tuple(world.processes)
+        """Processes of the fleet, and those with absent arms; the client is not one of them."""
         Process(world, CLIENT, Submitter)
         world.after_run, world.after_exit = self._after_run, self._after_exit
 
@@ -122,6 +135,59 @@ class Fleet:
     def node(self, name: str) -> Any:
         """Node of a process; None while it is down."""
         return self.world.processes[name].node
+
+    def auctioneer_builder(self, **options: Any) -> Any:
+        """Return what starts an auctioneer for the present arms."""
+        return self._auctioneer(self.arms, **options)
+
+    def build_auctioneer(self, **options: Any) -> None:
+        """Have the next start of the auctioneer be with these options, for the present arms."""
+        self.world.processes[AUCTIONEER]._build = self.auctioneer_builder(**options)
+
+    def end_faults(self) -> None:
+        """End all faults; the processes that are down start again."""
+        world = self.world
+        world.calm()
+        world.split({})
+        for process in world.processes.values():
+            process.disk.full, process.disk.broken, process.disk.crash_in = False, 0, 0
+            self.repair(process)
+            process._resume(process.boot)
+
+    def repair(self, process: Process) -> None:
+        """Let a broken machine start again, unless its arm has left."""
+        process.broken = process.name in self.builders and process.name not in self.arms
+
+    def retire(self, process: Process) -> None:
+        """Stop an arm as by SIGTERM: its process retires, and exits soon after."""
+        node: Any = process.node
+        if node is not None and not process.paused:
+            process._call(lambda: node.retire(process.real_s))
+            self.world.after(RETIRE_S, self._exit, process, process.boot)
+
+    def _exit(self, process: Process, boot: int) -> None:
+        if process.boot == boot:
+            process.kill("exits")
+
+    def doubt(self, arm: str) -> None:
+        """Note that the jobs whose last cycle an arm may have done, and has not reported, may end as unfinished."""
+        if (node := self.node(arm)) is not None:
+            self.unsure |= {active.job for active in node.executor.active if active.may_commit}
+            self.unsure |= {report.job for report, _ in node.executor.pending_reports()}
+
+    def forget(self, name: str) -> None:
+        """Note that a participant is about to lose what its journals have."""
+        nodes = {arm: node for arm in self.arms if (node := self.node(arm)) is not None}
+        self._excused |= {(name, each.award.award) for node in nodes.values() for each in node.executor.active}
+        central = None if self.alone else self.node(AUCTIONEER)
+        for source in [node.work_source for node in nodes.values()] if self.alone else [central] if central else []:
+            jobs, accepted = source.book.jobs.items(), self.submitter.accepted
+            self.doubtful |= {job for job, entry in jobs if any(grant.may_commit for grant in entry.grants.values())}
+            for job in [job for job in accepted if self.alone and job in source.book.past]:
+                del accepted[job]  # a history lacks jobs that have left the book
+        self.sent.renumber(name)
+        if name in self.builders:
+            self.doubt(name)
 
     def submit(self, job: JobSpec) -> None:
         """Have the client submit a job until there is a reply."""
@@ -205,15 +271,20 @@ class Fleet:
             ends_s = {arm: asked_s + active.lease_s for arm, asked_s in vote.granted_s.items()} if vote else {}
         for granter, end_s in ends_s.items():
             node = self.node(granter) if holder.real_s < end_s else None
-            book = None if node is None else (node.work_source if self.alone else node).book
-            if book is not None and name not in book.open:
+            source = node.work_source if self.alone and node is not None else node
+            if source is None or name in source.book.open:
+                continue
+            if (granter, name) not in self._excused or (self.alone and source._joined):
                 raise Violation(f"'{granter}' has no grant of '{name}', which '{holder.name}' still leases.")
 
     def _check_known(self) -> None:
         book = self.node(AUCTIONEER).book
         if len(self.submitter.accepted) > len(book.jobs) + len(book.past):
             lost = [name for name in self.submitter.accepted if name not in book.jobs and name not in book.past]
-            raise Violation(f"The auctioneer does not know '{lost[0]}', which it accepted.")
+            if self.world.now_s > self.forgetful_until_s:
+                raise Violation(f"The auctioneer does not know '{lost[0]}', which it accepted.")
+            for name in lost:  # its client sees that
+                self.submit(self.submitter.accepted.pop(name))
 
     def _after_exit(self, process: Process) -> None:
         if process.name in self.builders:

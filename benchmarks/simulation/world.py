@@ -283,6 +283,10 @@ class World:
         if receiver.up and receiver.boot == boot and self.reach(sender, receiver):
             receiver.put(what, *arguments)
 
+    def calm(self) -> None:
+        """End the loss, doubling and delay of messages."""
+        self.loss, self.doubling, self.slow = 0.0, 0.0, 1.0
+
     def split(self, group: dict[str, int]) -> None:
         """Cut the network in groups; names that are missing are in group 0."""
         for name, process in self.processes.items():

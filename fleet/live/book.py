@@ -83,6 +83,7 @@ from fleet.live.journal import (
     TimedState,
 )
 from fleet.live.records import (
+    FINISHED_BY,
     NO_AWARD,
     BookRecord,
     BookSnapshot,
@@ -743,7 +744,7 @@ class JobBook(TimedState[BookRecord]):
             entry = self.jobs.get(job.name)
             if entry is None or entry.state not in ("waiting", "awarded", "unfinished"):
                 continue
-            reason = f"'{record.arm}' had finished it; the journal did not know it."
+            reason = FINISHED_BY.format(record.arm)
             end = (NO_AWARD, record.arm, "finished", job.repetitions, record.time_s, reason)
             entry.arm = record.arm
             changes = self._set(entry, JobOutcome(job.name, *end))

@@ -9,9 +9,10 @@ what they have finished, what they have, and what they may have done: such a job
 The auctioneer waits for at most 20 s: what only an arm knows that comes online later may be done again.
 
 Without an auctioneer all arms keep one epoch. An arm whose journals are lost has forgotten what it granted and what was
-done: it does not take part beside arms that know it, unless a person requests it (`--new-epoch`). Then it adopts what
-the present arms have done and have. An arm takes part only after a majority, with itself, has replied with its history.
-Peers record the first claim of each start: an older copy is noticed only if a replying peer knows a later start.
+done: it does not take part beside arms that know it, unless a person requests it (`--new-epoch`). Then it waits for
+the length of a lease, adopts what the present arms have done and have, and takes them to be anywhere until they repeat
+their claims. An arm takes part only after a majority, with itself, has replied with its history. All record the first
+claim of each start: an older copy is noticed only if a replying peer knows a later start.
 """
 
 from collections.abc import Iterable, Iterator
@@ -19,21 +20,30 @@ from statistics import median_high
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import MOST_JOBS, Award, JobSpec, JobState
+from fleet.bus.protocol.auction import ABANDONED, MOST_JOBS, Award, JobSpec, JobState
 from fleet.bus.protocol.consensus import History, HistoryRequest, JobOutcome, with_finished
 from fleet.errors import BusError
 from fleet.live.book import JobBook
 from fleet.live.job_rules import is_same_work
 from fleet.live.journal import CommitPermitted, EpochBegun, JobsAccepted
-from fleet.live.records import BookRecord, ClaimNumbered, Granted, HistoryAdopted, JobEntry, JobSettled
+from fleet.live.records import (
+    FINISHED_BY,
+    NO_AWARD,
+    BookRecord,
+    ClaimNumbered,
+    Granted,
+    HistoryAdopted,
+    JobEntry,
+    JobSettled,
+)
 
 REPLY_S = 1.0
 """Real seconds that an arm has to reply."""
 MAX_NAMED = 5
 """Jobs that an error names."""
 REMEDY = (
-    "Stop the auctioneer and bring the journal back, or start with --new-epoch: then jobs that the arms have done are "
-    "not done again, and all other jobs of the old journal must be submitted again."
+    "Stop the auctioneer and bring the journal back, or {}start with --new-epoch: then jobs that the arms have done "
+    "are not done again, and all other jobs must be submitted again."
 )
 
 
@@ -57,7 +67,9 @@ def check_begin(fleet: str, histories: Iterable[History]) -> None:
     """
     for history in histories:
         if history.epoch:
-            raise BusError(f"The journal is empty, but fleet '{fleet}' has worked: {describe(history)}. {REMEDY}")
+            raise BusError(
+                f"The journal is empty, but fleet '{fleet}' has worked: {describe(history)}. {REMEDY.format('')}"
+            )
 
 
 def describe(history: History) -> str:
@@ -77,21 +89,19 @@ def check_journals(arm: str, number: int, epoch: str, histories: Iterable[Histor
     """Check that the journals of an arm are those that its peers know.
 
     Args:
-        number: As `first_number` returns it.
+        number: Least number of claims of the next start of the arm, by those in its journals.
         new_epoch: Whether a person has requested that the arm begins without the journals that its peers know.
 
     Raises:
         BusError: they are lost, older copies, or of another epoch: jobs might be done twice.
     """
     for peer in (history for history in histories if history.arm != arm):
-        claimed = peer.claims.get(arm, -1)
         if "" not in (epoch, peer.epoch) and epoch != peer.epoch:
             raise BusError(
                 f"The journals of '{arm}' are of the epoch '{epoch}', but {describe(peer)}. Jobs could be done twice. "
                 "Bring the right journals back, or put these aside and start the arm with --new-epoch."
             )
-        lost = claimed >= number or (claimed >= 0 and peer.epoch and not epoch)
-        if lost and not new_epoch:
+        if peer.claims.get(arm, -1) >= number and not new_epoch:
             raise BusError(
                 f"'{peer.arm}' knows claims of '{arm}' that its journals do not: they are lost, or older copies; "
                 f"{describe(peer)}. {REMEDY_OF_ARM}"
@@ -153,16 +163,25 @@ def _is_unknown(book: JobBook, job: JobSpec) -> bool:
 
 
 def _finished_last_cycles(book: JobBook, history: History) -> Iterator[BookRecord]:
-    """Yield the end of jobs that the arm had permission to commit: an older copy lacks its report."""
+    """Yield the end of jobs that the arm had permission to commit, or that are abandoned: an older copy lacks it."""
     held = {award.award for award in history.awards}
     for job in history.finished:
-        entry = book.jobs.get(job.name)
-        grant = None if entry is None or not _is_open(book, job, "finishing", "unfinished") else entry.grant
-        if grant is None or not grant.may_commit or grant.record.arm != history.arm or grant.record.award in held:
-            continue
-        reason = f"'{history.arm}' had finished it; the journal did not know it."
-        terms = (grant.record.award, history.arm, "finished", job.repetitions, book.time_s, reason)
-        yield JobSettled(JobOutcome(job.name, *terms))
+        entry, award = book.jobs.get(job.name), NO_AWARD
+        if not _is_abandoned(book, job):
+            grant = None if entry is None or not _is_open(book, job, "finishing", "unfinished") else entry.grant
+            if grant is None or not grant.may_commit or grant.record.arm != history.arm:
+                continue
+            award = grant.record.award
+        if award not in held:
+            terms = (award, history.arm, "finished", job.repetitions, book.time_s, FINISHED_BY.format(history.arm))
+            yield JobSettled(JobOutcome(job.name, *terms))
+
+
+def _is_abandoned(book: JobBook, job: JobSpec) -> bool:
+    """Return whether a job is abandoned here, such as one that was late before its arm replied."""
+    if job.name in book.jobs:
+        return _is_open(book, job, *ABANDONED)
+    return book.past.is_given_up(job.name) and book.past.is_same(job)
 
 
 def _of_award(book: JobBook, history: History, award: Award) -> Iterator[BookRecord]:

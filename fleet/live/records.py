@@ -45,6 +45,8 @@ RANKS = ("returned", "given_up", "cancelled", "unfinished", "finished")
 """Outcomes of a job: the later ones count more."""
 NO_AWARD = "?"
 """Award of an outcome that follows from none."""
+FINISHED_BY = "'{}' had finished it; the journal did not know it."
+"""Why a job is finished without a report."""
 
 
 class HistoryAdopted(msgspec.Struct, frozen=True, tag="history_adopted"):

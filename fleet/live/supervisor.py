@@ -50,7 +50,7 @@ class Backoff:
 
     def wait_s(self, failures: int) -> float:
         """Delay after a number of failures in a row, 1 or more."""
-        return min(self.first_s * self.factor ** (failures - 1), self.max_s)
+        return min(self.first_s * self.factor ** min(failures - 1, 100), self.max_s)  # a power beyond floats raises
 
 
 @dataclass(frozen=True, kw_only=True)

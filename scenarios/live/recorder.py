@@ -271,6 +271,7 @@ class Recorder:
                 if number < gap.last:
                     self.missing.append(structs.replace(gap, first=number + 1, after_s=time_s))
                 count.kept, count.missed = count.kept + 1, count.missed - 1
+                count.time_s = max(count.time_s, time_s)  # an auctioneer's times are in no order
                 return True
         return False
 

@@ -3,7 +3,6 @@
 import random
 import re
 from contextlib import nullcontext
-from copy import deepcopy
 from dataclasses import replace
 from functools import partial
 from itertools import islice
@@ -23,6 +22,7 @@ from fleet.bus.protocol.keys import of_arm, of_jobs
 from fleet.bus.protocol.operator import Pause, Settle
 from fleet.errors import BusError
 from fleet.live.consensus.node import ConsensusNode
+from fleet.live.space import ANYWHERE
 from scenarios.live.arm import refuse_auctioneer
 from tests.live.simulated import LONG, SPEED, SimulatedFleet, job, refused
 from tests.profiles import examples
@@ -306,6 +306,57 @@ def test_a_last_cycle_is_not_begun_again_if_its_arm_lost_all_journals(fleet_of, 
     assert (fleet.begun, fleet.states("a")) == ({"a": 1}, {"unfinished"})
 
 
+@pytest.mark.parametrize("is_copy", [True, False])
+def test_an_arm_without_the_journals_that_its_peers_know_is_refused_at_every_start(fleet_of, is_copy):
+    """A refused start is counted in its journal, too; with a new epoch it needs no further request."""
+    fleet = fleet_of(True)
+    process = fleet.world.processes["arm_2"]
+    fleet.until(lambda: begun(fleet, *fleet.arms))
+    process.kill("is stopped")
+    copy = process.disk.copy() if is_copy else {}
+    process.start()
+    fleet.until(lambda: begun(fleet, *fleet.arms))
+    process.kill("is stopped")
+    process.disk.restore(copy)
+    for _ in range(3):
+        process.start()
+        fleet.run(3.0)
+        assert not process.up
+    for new_epoch in (True, False):
+        fleet.builders["arm_2"].new_epoch = new_epoch
+        process.kill("is stopped")
+        process.start()
+        fleet.until(lambda: process.node.work_source._joined)
+
+
+@pytest.mark.parametrize("is_copy", [True, False])
+@pytest.mark.parametrize("repeats", [True, False])
+def test_a_new_epoch_begins_with_unknown_positions_until_each_peer_repeats_its_claim(fleet_of, is_copy, repeats):
+    """All peers were at home when the journals were copied, and one has left since."""
+    fleet = fleet_of(True)
+    process = fleet.world.processes["arm_2"]
+    fleet.until(lambda: begun(fleet, *fleet.arms))
+    process.kill("is stopped")
+    copy = process.disk.copy() if is_copy else {}
+    fleet.submit(job("a", 400))
+    fleet.until(lambda: bool(fleet.away))
+    process.start()
+    fleet.run(5.0)  # it replies to the last claims of its peers
+    fleet.forget("arm_2")
+    process.kill("is stopped")
+    process.disk.restore(copy)
+    if not repeats:
+        fleet.lose("claim")
+    fleet.builders["arm_2"].new_epoch = True
+    process.start()
+    fleet.until(lambda: process.node.work_source._joined)
+    fleet.run(3.0)
+    spaces = fleet.node("arm_2").work_source.book.taken_space()
+    away = {frozenset([space]) for space in fleet.away.values()}
+    expected = {frozenset(), *away} if repeats else {frozenset([ANYWHERE])}
+    assert {spaces[arm] for arm in ("arm_0", "arm_1")} == expected
+
+
 @pytest.mark.parametrize("witness_first", [True, False])
 def test_a_restored_copy_of_a_granter_from_before_its_last_start_is_noticed(fleet_of, witness_first):
     """By the peer that has forgotten all but the first claim of that start."""
@@ -316,7 +367,7 @@ def test_a_restored_copy_of_a_granter_from_before_its_last_start_is_noticed(flee
     *others, witness = fleet.arms
     for arm in others:
         processes[arm].kill("is stopped")
-    copies = {arm: deepcopy(processes[arm].disk.names) for arm in others}
+    copies = {arm: processes[arm].disk.copy() for arm in others}
     for arm in others:
         processes[arm].start()
     fleet.run(2.0)
@@ -326,8 +377,7 @@ def test_a_restored_copy_of_a_granter_from_before_its_last_start_is_noticed(flee
     (granter,) = {*others} - {holder}
     fleet.cut(holder)
     processes[granter].kill("is killed")
-    disk = processes[granter].disk
-    disk.names, disk._durable = copies[granter], dict(copies[granter])
+    processes[granter].disk.restore(copies[granter])
     fleet.run(8.0)
     for arm in (witness, granter) if witness_first else (granter, witness):
         processes[arm].start()
@@ -403,13 +453,13 @@ def test_an_arm_does_not_start_with_journals_of_a_fleet_of_other_arms(fleet_of, 
     fleet.submit(*(job(f"job {number}", 2, value=1.0) for number in range(20 if compacted else 1)))
     fleet.until(lambda: fleet.is_everywhere("job 0", "finished"))
     builder, process = fleet.builders["arm_0"], fleet.world.processes["arm_0"]
-    three = builder._membership
-    builder._membership = replace(three, fleet=replace(three.fleet, arms=(*fleet.arms, "arm_3", "arm_4")))
+    three = builder.membership
+    builder.membership = replace(three, fleet=replace(three.fleet, arms=(*fleet.arms, "arm_3", "arm_4")))
     fleet.restart("arm_0")
     assert not process.up
     (line,) = fleet.logged("exits")
     assert "are of a fleet of the arms arm_0, arm_1, arm_2, not of arm_0, arm_1, arm_2, arm_3, arm_4" in line
-    builder._membership = three
+    builder.membership = three
     process.start()
     fleet.until(lambda: begun(fleet, "arm_0"))
 

@@ -195,6 +195,14 @@ def test_a_repeated_message_of_another_time_is_no_restart(tmp_path, make, table)
     assert read_parts(tmp_path, "gaps").num_rows == 0
 
 
+def test_a_fetched_result_that_is_later_than_the_next_one_is_recorded_once(tmp_path):
+    """The next one is a late report; all are repeated after a restart."""
+    sent = [replace(result(number), time_s=time_s) for number, time_s in enumerate((10.0, 30.0, 20.0))]
+    recorded(tmp_path, sent[0], sent[2], sent[1], *sent, status="finished")
+    assert sorted(read_parts(tmp_path, "results")["number"].to_pylist()) == [0, 1, 2]
+    assert read_parts(tmp_path, "gaps").num_rows == 0
+
+
 @pytest.mark.parametrize("make", [result, operation])
 def test_numbers_that_an_older_copy_of_the_journal_uses_again_are_kept_and_named(tmp_path, make):
     """The sender repeats first what the copy has."""

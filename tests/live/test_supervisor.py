@@ -7,7 +7,7 @@ import threading
 import time
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fleet.errors import FleetError
@@ -59,6 +59,7 @@ def until(condition):
     return stopped
 
 
+@example(2000, 0.5, 2.0, 2.0)  # an hour of failures
 @given(st.integers(1, 60), st.floats(0.1, 2.0), st.floats(1.0, 4.0), st.floats(2.0, 60.0))
 def test_delays_grow_up_to_a_limit(failures, first_s, factor, max_s):
     backoff = Backoff(first_s=first_s, factor=factor, max_s=max_s)

@@ -132,9 +132,10 @@ class EpochCheck:
         book = self._auctioneer.book
         if history.epoch not in ("", book.epoch) and not book.succeeds:
             if history.arm not in self._foreign:
+                remedy = REMEDY.format("put this one aside and ")
                 self._foreign[history.arm] = (
                     f"No jobs are accepted or awarded: the journal has the epoch '{book.epoch}', but "
-                    f"{describe(history)}. {REMEDY} Or stop '{history.arm}', if it alone is wrong."
+                    f"{describe(history)}. {remedy} Or stop '{history.arm}', if it alone is wrong."
                 )
                 _LOG.error("%s", self._foreign[history.arm])
             return False

@@ -390,6 +390,10 @@ class Claimant:
         self._operations[operation.request.request] = operation
         self._due = True
 
+    def repeat_for(self, arm: str) -> None:
+        """Repeat the claim for an arm that has started again: it may have lost its journals."""
+        self._answered.pop(arm, None)
+
     def revoke(self, is_stopped: Callable[[str], bool]) -> None:
         """Withdraw requests for jobs, and have the arm return those whose last cycle is not permitted."""
         for award, pending in list(self.pending.items()):

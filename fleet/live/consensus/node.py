@@ -29,9 +29,10 @@ from fleet.live.consensus.participant import TOO_FEW, Membership, Participant
 from fleet.live.desk import JobDesk
 from fleet.live.epochs import REPLY_S, adopted, ask_arms, check_journals, history_of
 from fleet.live.job_rules import SHIFT_ENDED
-from fleet.live.journal import EpochBegun, Journal, Started, TimeRecorder, own_records
+from fleet.live.journal import EpochBegun, Journal, SpaceTaken, Started, TimeRecorder, own_records
 from fleet.live.rate_limit import RateLimitedWarnings
 from fleet.live.records import BookRecord, JobEntry
+from fleet.live.space import ANYWHERE
 
 _LOG = logging.getLogger(__name__)
 
@@ -43,11 +44,6 @@ LAST_S = 10.0
 """Real seconds after the end of the shift that an arm waits at most for last cycles, its own and its peers'."""
 NOT_YET_S = 1e9
 """Real seconds until the fleet's time would begin if no arm started it: never."""
-
-
-def first_number(arm: str, boot: int, book: JobBook) -> int:
-    """Return the number after which the claims and bids of a start of an arm are counted."""
-    return max(boot, book.numbers.get(arm, -1) // NUMBERS_PER_BOOT + 1) * NUMBERS_PER_BOOT
 
 
 class ConsensusNode(JobDesk):
@@ -95,15 +91,18 @@ class ConsensusNode(JobDesk):
             )
         timing, excludes = membership.timing, membership.excludes
         granter = Granter(self._name, roster, book, journal.append, real_s=real_s, timing=timing, excludes=excludes)
-        self._first_number, self._new_epoch = first_number(self._name, boot, book), new_epoch
-        boot = self._first_number // NUMBERS_PER_BOOT
+        # By its claims: a start that was refused counts as a boot.
+        self._first_number = (book.numbers.get(self._name, -1) // NUMBERS_PER_BOOT + 1) * NUMBERS_PER_BOOT
+        """Least number of the claims of this start, by those in its journals."""
+        self._new_epoch = new_epoch
+        boot = max(boot, self._first_number // NUMBERS_PER_BOOT)
         self.participant = Participant(arm, granter, membership, boot=boot, rng=Random(f"{self._name} {boot}"))
         self._stream = deque(membership.stream)
         self._warn = RateLimitedWarnings(self._name)
         self._tokens: set[str] = set()
         self._begun = self._busy = False
         self._ended_s = math.inf
-        self._since_s = real_s
+        self._started_s = self._since_s = real_s
         """Real second since which a majority has been present."""
         self.wake_s = math.inf
         arm.set_clock(FleetClock(self._speed, real_s + NOT_YET_S))
@@ -173,10 +172,15 @@ class ConsensusNode(JobDesk):
         if len({each.arm for each in histories} | {self._name}) < self._majority:
             return
         known = max((history.claims.get(self._name, -1) for history in histories), default=-1)
-        if known >= number or (known >= 0 and not self._epoch):
+        if known >= number:
+            # It may have granted leases of which it does not know.
+            if time.monotonic() < self._started_s + granter.timing.counted_lease_s:
+                return
             _LOG.warning("Arm '%s' adopts what %d arm(s) have done and have.", self._name, len(histories))
             for history in (each for each in histories if each.arm != self._name):
                 granter.adopt(adopted(self.book, history), time.monotonic())
+            peers = sorted(granter.roster - {self._name})  # each repeats its claim for this arm
+            self.book.record(*(SpaceTaken(arm, (ANYWHERE,)) for arm in peers))
             self.participant.count_after(known)
         self._take_epoch(next((history.epoch for history in histories if history.epoch), ""))
         self._joined = True

@@ -158,6 +158,8 @@ class Participant:
         before = self._bids.get(bid.arm)
         if bid.arm not in self.granter.roster or (before is not None and bid.number < before[0].number):
             return
+        if before is not None and bid.number // NUMBERS_PER_BOOT > before[0].number // NUMBERS_PER_BOOT:
+            self.claimant.repeat_for(bid.arm)
         self._bids[bid.arm], self._granted[bid.arm] = (bid, real_s), self.granter.granted_to(bid.arm)
         self._refusals.note(bid)
         if before is None or _offered(before[0]) != _offered(bid):

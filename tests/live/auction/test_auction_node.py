@@ -35,9 +35,9 @@ from fleet.live.auction import node as auction_node
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.node import HOLD_S, AuctionNode
 from fleet.live.book import JobBook
-from fleet.live.epochs import kept_time_s
+from fleet.live.epochs import adopted, kept_time_s
 from fleet.live.journal import EpochBegun, JobsAccepted, Journal
-from tests.live.simulated import LONG, TIMING, SimulatedFleet, job, refused
+from tests.live.simulated import LONG, SPEED, TIMING, SimulatedFleet, job, refused
 
 STATUS = keys.of_jobs("f", "status")
 
@@ -279,9 +279,12 @@ def test_jobs_are_refused_when_arms_of_an_older_epoch_come_later(one):
     one.until(lambda: boss(one)._epochs.objection)
     reason = refused(lambda: one.submit(job("a", 2)))
     assert "the journal has the epoch" in reason
-    assert "--new-epoch" in reason
     assert reason.endswith("Or stop 'arm_0', if it alone is wrong.")
     assert within(one, lambda: boss(one)._epochs.admitted(["arm_0"])) == frozenset()
+    assert "put this one aside and start with --new-epoch" in reason
+    lose_journal(one)
+    one.auctioneer(new_epoch=True)
+    one.until(lambda: one.is_everywhere("a", "finished"))
 
 
 def test_an_award_that_an_arm_still_has_is_adopted(one, monkeypatch):
@@ -314,6 +317,24 @@ def test_an_older_copy_of_the_journal_learns_what_is_finished(one):
     one.until(lambda: one.is_everywhere("a", "finished") and one.is_everywhere("b", "finished"))
     one.run(3.0)
     assert one.finished == {"a": 1, "b": 1}
+
+
+def test_an_older_copy_learns_that_a_job_was_finished_before_it_was_late(fleet_of):
+    """The auctioneer abandons it before its arm replies."""
+    fleet, copy, _ = begun_after_copy(fleet_of, job("a", 1, due_s=150.0, expires=True))
+    fleet.until(lambda: fleet.is_everywhere("a", "finished"))
+    fleet.run(150.0 / SPEED)
+    restore(fleet, copy)
+    fleet.until(lambda: fleet.states("a") == {"given_up"})
+    fleet.until(lambda: fleet.states("a") == {"finished"})
+
+
+def test_a_history_corrects_an_abandoned_job_that_has_left_the_book():
+    book, spec = JobBook(), job("a", 1)
+    book.past.add(spec, finished=False)
+    assert not adopted(book, History("arm_0", finished=(job("a", 2),)))  # another job of that name
+    book.record(*adopted(book, History("arm_0", finished=(spec,))))
+    assert book.past.is_finished("a")
 
 
 def test_an_older_copy_of_the_journal_learns_of_a_permission_to_commit(fleet_of):
