@@ -117,7 +117,7 @@ class SimulatedFleet(Fleet):
             try:
                 return replies[0].first(key)
             except NoReply:
-                continue
+                self.run(0.5)
         raise AssertionError(f"no reply under {key}")
 
     def submit(self, *jobs: JobSpec) -> tuple[Admission, ...]:

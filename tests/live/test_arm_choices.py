@@ -480,6 +480,18 @@ def test_without_a_majority_no_job_is_accepted(fleet_of):
     assert not fleet.submit(here)[0].accepted
 
 
+def test_a_job_that_the_first_arm_refuses_is_kept_by_no_other_arm(fleet_of):
+    """Another one knows what it waits for, and would accept it."""
+    fleet = fleet_of(True)
+    fleet.run(12.0)
+    fleet.cut("arm_2")
+    fleet.node("arm_2").work_source.participant.granter.add_jobs([job("a", release_s=1e6)])
+    fleet.world.split({})
+    assert fleet.submit(job("b", after=("a",), release_s=1e6))[0].reason.startswith("It waits for 'a', which is unknown")
+    fleet.until(lambda: fleet.is_everywhere("a", "waiting"))
+    assert "b" not in {name for known in fleet.known() for name in known}
+
+
 def test_an_arm_that_restarts_without_a_majority_replies_to_clients_and_neither_claims_nor_grants(fleet_of):
     fleet = fleet_of(True, 5)
     fleet.submit(job("a", 1, release_s=1000.0))

@@ -366,14 +366,15 @@ class ConsensusNode(JobDesk):
         return self.participant.status_of(entries, time.monotonic())
 
     def _submit(self, submission: Submission) -> SubmissionReply:
+        self._check_first()  # it alone decides: the others get what it accepts with its next claim
         if self._lacks_majority:  # the others may accept another job of the same name
-            self._check_first()
             raise RefusedForNow(f"{self._trouble()} Submit it again then.")
         later = {job.name: job for _, job in self._stream}
         admissions = self.book.admit(submission.jobs, self.time_s, later)
         accepted = [job for job, reply in zip(submission.jobs, admissions, strict=True) if reply.accepted]
         self.participant.granter.add_jobs(accepted, submission.by)
-        self._check_first()
+        for job in accepted:
+            self.participant.claimant.send_job(job)
         return SubmissionReply(self._name, admissions, self._epoch)
 
     def _clear(self, request: ClearRequest) -> Cleared:
