@@ -24,6 +24,7 @@ from scenarios.processes import Queue
 from scenarios.show.comparison_page import Judged, verdict
 from scenarios.spec.parse import override
 from scenarios.spec.schema import Scenario
+from tests.own_policies import IDLE
 
 
 def study_of(scenario: Scenario, *policies: str, seeds: int = 3, **more) -> Study:
@@ -231,6 +232,24 @@ def test_a_policy_is_another_one_when_what_it_imports_has_changed(tmp_path, monk
     if not is_package:
         (folder / "helper.py").write_text("def (", encoding="utf-8")
         assert policy_hash(policy)  # what cannot be loaded is told elsewhere
+
+
+def test_a_worker_gives_every_policy_the_modules_beside_it(scenario, plans, tmp_path):
+    """Of two policies of one worker process, whose helpers have one name, one waits and the other one works."""
+    for folder, base in (("idle", "Idle"), ("busy", "Fifo")):
+        (tmp_path / folder).mkdir()
+        text = IDLE if base == "Idle" else "from agents.rules import Fifo\n"
+        (tmp_path / folder / "helper.py").write_text(text, encoding="utf-8")
+        (tmp_path / folder / "own.py").write_text(f"from helper import {base} as {base}Own\n", encoding="utf-8")
+    own = [f"{tmp_path / 'idle' / 'own.py'}:IdleOwn", f"{tmp_path / 'busy' / 'own.py'}:FifoOwn"]
+    rows = runner.run_study(study_of(scenario, *own, "fifo", seeds=1), cache_dir=plans, workers=1)
+    idle, busy, fifo = (row.outcome for row in rows)
+    assert idle is not None
+    assert idle.finished == 0
+    assert busy == fifo
+    hashes = [policy_hash(each) for each in own]
+    (tmp_path / "busy" / "helper.py").write_text("from agents.rules import Edd as Fifo\n", encoding="utf-8")
+    assert [policy_hash(each) == before for each, before in zip(own, hashes, strict=True)] == [True, False]
 
 
 @pytest.mark.ci_slow
