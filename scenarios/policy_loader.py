@@ -218,7 +218,7 @@ def source_of(name: str) -> Path | None:
 
 
 def trainings_of(name: str) -> tuple[str, ...]:
-    """The policies that a name with * stands for: trainings of one recipe, in folders; of another name itself.
+    """The policies that a pattern stands for: trainings of one recipe, in folders; of another name itself.
 
     Raises:
         FleetError: no folder has such a name.
@@ -234,8 +234,8 @@ def trainings_of(name: str) -> tuple[str, ...]:
 
 
 def has_trainings(name: str) -> bool:
-    """Whether a name stands for several trainings."""
-    return "*" in name and not is_on_bus(name)
+    """Whether a name is a pattern of folders, with * or ?, and stands for several trainings."""
+    return ("*" in name or "?" in name) and not is_on_bus(name)
 
 
 def label(name: str) -> str:

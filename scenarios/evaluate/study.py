@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from agents.learned.cards import check_recipe
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError, nearest
 from fleet.fields import MAX_SEED
@@ -156,6 +157,8 @@ class Study(StudySpec):
         for policy, own in self.own_trainings.items():
             for each in own:
                 check_policy(each, self.decision_limit_s)
+            if len(own) > 1:
+                check_recipe(policy, [source for each in own if (source := source_of(each))])
             if len(own) > 1 and (self.trainings > 1 or self.fleets > 1):
                 raise FleetError(f"'{policy}' has {len(own)} trainings: then --trainings and --fleets must be 1.")
             if len(own) not in (1, self.most_trainings):

@@ -359,9 +359,27 @@ def test_folders_of_trainings_are_one_policy(scenario, plans, tmp_path):
         ({"fleets": 2}, "then --trainings and --fleets must be 1"),
         ({"policies": [every, str(tmp_path / "pairs-1*")]}, "has 2 trainings, another policy 3: give as many"),
         ({"policies": [str(tmp_path / "none-*")]}, "There is no folder"),
+        ({"policies": [str(tmp_path / "none-?")]}, "There is no folder"),
     ):
         with pytest.raises(FleetError, match=said):
             study_of(scenario, **({"policies": ["wsept", every]} | given))
+
+
+def test_trainings_of_one_pattern_differ_in_their_seed_alone(scenario, tmp_path):
+    recipe = {"suite": "train", "config": {"learning_rate": 0.02, "seed": 0}, "prepared": 48}
+    for k, changed in enumerate(
+        ({}, {"config": {"learning_rate": 0.02, "seed": 1}, "validation": 0.5, "iterations": 7}, {"prepared": 12})
+    ):
+        save_pairs(np.zeros(PARAMETERS), tmp_path / f"pairs-{k}", **(recipe | changed))
+    assert study_of(scenario, str(tmp_path / "pairs-[01]*")).most_trainings == 2
+    every = f"limited:{tmp_path / 'pairs-?'}"
+    with pytest.raises(FleetError, match=r"pairs-0' has --instances = 48, '.*pairs-2' 12\. Give a pattern for each"):
+        study_of(scenario, every)
+    save_pairs(np.zeros(PARAMETERS), tmp_path / "pairs-2", **(recipe | {"config": {"learning_rate": 0.1, "seed": 2}}))
+    with pytest.raises(FleetError, match=r"differ in more than their seed: .* has learning_rate = 0\.02, '.*-2' 0\.1"):
+        study_of(scenario, every)
+    save_pairs(np.zeros(PARAMETERS), tmp_path / "pairs-2", **recipe)
+    assert study_of(scenario, every).most_trainings == 3
 
 
 def test_seeds_of_instances_are_their_own():
