@@ -191,7 +191,7 @@ def compare(
     scenario: str | Path | Scenario,
     policies: Sequence[str],
     *,
-    seeds: Sequence[int] = range(20),
+    seeds: Sequence[int] | Array = range(20),
     baseline: str | None = None,
     difficulty: str = "twin",
     risk: RiskName = RISK,
@@ -226,6 +226,8 @@ def compare(
         raise FleetError(f"policies must be a list of names, for example ['wspt', 'mine.py:Mine'] (got {policies!r}).")
     for policy in policies:
         check_name(policy)
+    if isinstance(seeds, np.ndarray) and seeds.ndim == 1:
+        seeds = seeds.tolist()
     if isinstance(seeds, str) or not isinstance(seeds, Sequence):
         raise FleetError(f"seeds must be a list of integers, for example range(3) (got {seeds!r}).")
     try:
