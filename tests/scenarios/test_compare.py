@@ -557,3 +557,8 @@ def test_bad_sources_are_named(thermofleet, small_toml) -> None:
     assert thermofleet("compare", small_toml, "--policies", "wspt,wspt@blind", "--difficulty", "blind").refused(
         "The policy 'wspt@blind' is given twice"
     )
+
+
+@pytest.mark.parametrize("names", [",", "wspt,,fifo", "wspt,", ""])
+def test_an_empty_name_is_told(thermofleet, small_toml, names) -> None:
+    assert thermofleet("compare", small_toml, "--policies", names).refused(f"A name is empty in '{names}'.")
