@@ -142,13 +142,13 @@ def listed(values: Iterable[object]) -> str:
     return ", ".join(texts) or "none"
 
 
-def apart(one: float, other: float, digits: int = 4) -> tuple[str, str]:
+def distinguish(one: float, other: float, digits: int = 4) -> tuple[str, str]:
     """Two numbers in an error message, with as many significant digits as show that they differ."""
-    for count in range(digits, 18):
+    for count in range(digits, 17):
         texts = f"{one:.{count}g}", f"{other:.{count}g}"
         if texts[0] != texts[1] or one == other:
             return texts
-    return repr(one), repr(other)
+    return repr(float(one)), repr(float(other))
 
 
 def nearest(name: str, allowed: Iterable[str]) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 from fleet.bus.exchange.channel import PERFECT
 from fleet.engine.batch import RewardWeights
 from fleet.engine.observe import PEAK_HIGH_C
-from fleet.errors import FleetError, apart, printable
+from fleet.errors import FleetError, distinguish, printable
 from fleet.files import atomic_path
 from fleet.robot import ThermalLimits
 from fleet.seeding import shift_seeds
@@ -236,27 +236,27 @@ def _problems_of_shift(row: ResultLine, line: ManifestLine, known: ShiftReferenc
     limits = _limits_of(line)
     bound = min(max(own["peak_c"], limits.ambient_c), float(PEAK_HIGH_C))
     if abs(own["peak_c"] - bound) > SLACK:
-        peak, _ = apart(own["peak_c"], bound)
+        peak, _ = distinguish(own["peak_c"], bound)
         yield f"has a hottest motor of {peak} °C, not within {limits.ambient_c:g} to {PEAK_HIGH_C:g}"
     least, most = limits.value_of(int(own["finished"]))
     bound = min(max(own["value"], least), most)
     if abs(own["value"] - bound) > SLACK * most:
-        value, limit = apart(own["value"], bound)
+        value, limit = distinguish(own["value"], bound)
         at = "least" if own["value"] < bound else "most"
         yield f"has a finished value of {value}, but {own['finished']:g} of its jobs have at {at} {limit}"
     weights = limits.weights
     costs = -weights.faults * own["faults"] - weights.above_warning * own["above_warning_min"]
     if reward > (net := own["value"] - costs) + SLACK * (1 + own["value"] + costs):
-        given, bound = apart(reward, net)
+        given, bound = distinguish(reward, net)
         yield (
             f"has a reward of {given}, above {bound}: the finished value {own['value']:.4g} less {costs:.4g} for "
             "faults and minutes above the warning limit; all else is a cost"
         )
     if known and reward < (worst := known.random - MOST_LOSS * max(known.unit, known.upper - known.random)):
-        yield "has a reward of {}, below what the worst policy could lose ({})".format(*apart(reward, worst))
+        yield "has a reward of {}, below what the worst policy could lose ({})".format(*distinguish(reward, worst))
     if known and reward > known.upper + SLACK * (1 + abs(known.upper)):
         yield "has a reward of {}, above the upper bound {}, which no policy exceeds".format(
-            *apart(reward, known.upper)
+            *distinguish(reward, known.upper)
         )
     yield from _problems_of_heat(own, limits.heat)
 
@@ -269,7 +269,7 @@ def _problems_of_heat(own: Mapping[str, float], heat: ThermalLimits) -> Iterator
         (f"{minutes:.4g} min above the warning limit of", minutes > 0, heat.warning_c),
     ):
         if peak_c < limit_c - SLACK_K if happened else peak_c > limit_c + SLACK_K:
-            peak, limit = apart(peak_c, limit_c)
+            peak, limit = distinguish(peak_c, limit_c)
             yield f"has {what} {limit} °C, but a hottest motor of {peak} °C"
     if not faults and own["availability"] < 1 - SLACK:
         yield f"has no faults, but an availability of {own['availability']:.9g}, which only faults lower"
