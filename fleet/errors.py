@@ -142,6 +142,15 @@ def listed(values: Iterable[object]) -> str:
     return ", ".join(texts) or "none"
 
 
+def distinguish(one: float, other: float, digits: int = 4) -> tuple[str, str]:
+    """Two numbers in an error message, with as many significant digits as show that they differ."""
+    for count in range(digits, 17):
+        texts = f"{one:.{count}g}", f"{other:.{count}g}"
+        if texts[0] != texts[1] or one == other:
+            return texts
+    return repr(float(one)), repr(float(other))
+
+
 def nearest(name: str, allowed: Iterable[str]) -> str:
     """End of an error message: the allowed names, or the most similar ones of very many, and which one was meant.
 

@@ -76,7 +76,7 @@ class Option:
         if self.kind and (isinstance(value, bool) or not isinstance(value, number)):
             return f"{name} must be {'an integer' if self.kind is int else 'a number'} (got {value!r})."
         if self.kind and not self._within(value):
-            return f"{name} must be {self.limits} (got {value if isinstance(value, Integral) else f'{value:g}'})."
+            return f"{name} must be {self.limits} (got {value if isinstance(value, Integral) else f'{value:.15g}'})."
         return ""
 
     def _within(self, value: Any) -> bool:  # a number, also of NumPy

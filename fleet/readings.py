@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fleet.errors import distinguish
 from fleet.heat.motor import gen3_motors, thermal_data
 from fleet.robot import JOINTS, ThermalLimits, half_turn
 
@@ -326,8 +327,9 @@ def _wrong_unit(temp_c: Array) -> Iterator[BadReading]:
     usual_c = np.median(temp_c, axis=0)
     if usual_c.min() > COOL_C or usual_c.max() > HOT_C:
         joint = int(usual_c.argmax())
-        what = f"above {HOT_C:g} °C" if usual_c.max() > HOT_C else f"and that of no joint is below {COOL_C:g} °C"
-        what = f"the median temperature of joint {joint + 1} is {usual_c[joint]:.5g}, {what}"
+        usual, hot = distinguish(usual_c[joint], HOT_C)
+        what = f"above {hot} °C" if usual_c.max() > HOT_C else f"and that of no joint is below {COOL_C:g} °C"
+        what = f"the median temperature of joint {joint + 1} is {usual}, {what}"
         yield BadReading(what, _unit_of(usual_c[usual_c > COOL_C]))
 
 

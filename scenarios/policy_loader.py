@@ -6,10 +6,13 @@ import importlib
 import importlib.util
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
 from inspect import signature
 from pathlib import Path
 from traceback import extract_tb
@@ -33,8 +36,8 @@ METHODS = {
     "arm": {"reset": "rng", "choose": "observation, arm_index"},
 }
 """Methods, and their arguments, that a policy of each scope must have."""
-
-
+OWN_PACKAGES = ("fleet", "agents", "twin", "scenarios", "thermofleet")
+"""Of this project: no module beside a policy takes their place, and the hash of the code covers them."""
 BUS = "bus:"
 """Before the name of a policy in another process."""
 
@@ -215,7 +218,7 @@ def source_of(name: str) -> Path | None:
 
 
 def trainings_of(name: str) -> tuple[str, ...]:
-    """The policies that a name with * stands for: trainings of one recipe, in folders; of another name itself.
+    """The policies that a pattern stands for: trainings of one recipe, in folders; of another name itself.
 
     Raises:
         FleetError: no folder has such a name.
@@ -231,8 +234,8 @@ def trainings_of(name: str) -> tuple[str, ...]:
 
 
 def has_trainings(name: str) -> bool:
-    """Whether a name stands for several trainings."""
-    return "*" in name and not is_on_bus(name)
+    """Whether a name is a pattern of folders, with * or ?, and stands for several trainings."""
+    return ("*" in name or "?" in name) and not is_on_bus(name)
 
 
 def label(name: str) -> str:
@@ -345,10 +348,67 @@ def _module(where: str, name: str) -> ModuleType:
         raise FleetError(f"Policy '{name}': there is no file '{where}'.")
     module = importlib.util.module_from_spec(spec)
     try:
-        spec.loader.exec_module(module)
+        with _importing_beside(path, module):
+            spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:  # of the file
         raise _not_loaded(name, where, error, last_line(error, path)) from error
     return module
+
+
+@dataclass(frozen=True)
+class _Beside(MetaPathFinder):
+    """Imports the modules and packages in the folder of a policy, but none that the standard library or this project
+    has, nor from the folder of installed packages."""
+
+    folder: Path
+    names: frozenset[str]
+
+    @classmethod
+    def of(cls, file: Path) -> "_Beside":
+        folder = file.absolute().parent
+        packages = {each.parent.name for each in folder.glob("*/__init__.py")}
+        names = packages.union(each.stem for each in folder.glob("*.py")) - {*OWN_PACKAGES, *sys.stdlib_module_names}
+        return cls(folder, frozenset(() if "site-packages" in folder.parts else names))
+
+    def find_spec(self, fullname: str, path: object, target: object = None) -> ModuleSpec | None:
+        return PathFinder.find_spec(fullname, [str(self.folder)]) if path is None and fullname in self.names else None
+
+    def take(self) -> dict[str, ModuleType]:
+        """Remove what has these names, and modules in it, from `sys.modules`."""
+        taken = [name for name in sys.modules if name.partition(".")[0] in self.names]
+        return {name: sys.modules.pop(name) for name in taken}
+
+
+_BESIDE: dict[Path, dict[str, tuple[ModuleType, int]]] = {}
+"""Modules that files of a folder have imported from it, by folder and name, each with the time of its file's change."""
+
+
+@contextmanager
+def _importing_beside(file: Path, module: ModuleType) -> Iterator[None]:
+    """Let a file import modules of its folder in the block, as a script does; all anew if one of them has changed.
+
+    Afterwards they leave `sys.modules`: files of two folders never share a module of one name.
+    """
+    beside = _Beside.of(file)
+    others = beside.take()
+    kept = _BESIDE.get(beside.folder, {})
+    if all(_changed_ns(each) == changed_ns for each, changed_ns in kept.values()):
+        sys.modules.update({name: each for name, (each, _) in kept.items()})
+    sys.modules[module.__name__] = module  # where dataclasses look up annotations
+    sys.meta_path.insert(0, beside)
+    importlib.invalidate_caches()
+    try:
+        yield
+    finally:
+        sys.meta_path.remove(beside)
+        _BESIDE[beside.folder] = {name: (each, _changed_ns(each)) for name, each in beside.take().items()}
+        sys.modules.pop(module.__name__, None)
+        sys.modules.update(others)
+
+
+def _changed_ns(module: ModuleType) -> int:
+    file = Path(getattr(module, "__file__", None) or "")
+    return file.stat().st_mtime_ns if file.is_file() else 0
 
 
 def _not_loaded(name: str, where: str, error: BaseException, line: int | None) -> FleetError:

@@ -7,6 +7,7 @@ import mink
 import numpy as np
 
 from fleet.arm.model import ArmModel
+from fleet.errors import distinguish
 from fleet.robot import GEN3, JOINTS
 
 Array = np.ndarray
@@ -189,10 +190,12 @@ def angle_between(a: Array, b: Array) -> float:
 
 
 def _out_of_reach(tool_m: float, wrist_m: float) -> str:
-    reason = f"reach: {tool_m:.3f} m from the shoulder, the arm has {REACH_M:.3f} m"
+    tool, reach = distinguish(tool_m, REACH_M, 3)
+    reason = f"reach: {tool} m from the shoulder, the arm has {reach} m"
     if tool_m > REACH_M:
         return reason
-    return f"{reason}; with this tool direction its wrist would be {wrist_m:.3f} m away, at most {_WRIST_M:.3f} m"
+    wrist, most = distinguish(wrist_m, _WRIST_M, 3)
+    return f"{reason}; with this tool direction its wrist would be {wrist} m away, at most {most} m"
 
 
 def _elbow(wrist: Array, elbow_deg: float, near: Array) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 import ruckig
 
 from fleet.arm.model import ArmModel, links_of, payload_bodies, set_payload_balls
-from fleet.errors import InfeasibleJob
+from fleet.errors import InfeasibleJob, distinguish
 from fleet.motion import RATE_HZ, Phase
 from fleet.robot import GEN3, JOINTS
 
@@ -38,9 +38,8 @@ def limit_violation(q: Array, qd: Array, qdd: Array, tau: Array, position_range:
         share = value / limit
         sample, joint = (int(i) for i in np.unravel_index(np.argmax(share), share.shape))
         if share[sample, joint] > 1.0 + _TOLERANCE:
-            return sample, (
-                f"{name}: joint_{joint + 1} needs {value[sample, joint]:.1f} {unit}, allowed {limit[joint]:.1f} {unit}"
-            )
+            needed, allowed = distinguish(value[sample, joint], limit[joint])
+            return sample, f"{name}: joint_{joint + 1} needs {needed} {unit}, allowed {allowed} {unit}"
     return None
 
 

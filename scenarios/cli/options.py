@@ -299,8 +299,15 @@ def parse_randomisation(texts: list[str] | None) -> "Randomisation | None":
 
 
 def split_names(text: str) -> list[str]:
-    """Names that are separated by commas."""
-    return [name.strip() for name in text.split(",")]
+    """Names that are separated by commas.
+
+    Raises:
+        FleetError: one is empty.
+    """
+    names = [name.strip() for name in text.split(",")]
+    if "" in names:
+        raise FleetError(f"A name is empty in '{printable(text)}'. Separate names by one comma each.")
+    return names
 
 
 def the_fleet(name: str, endpoint: str) -> str:

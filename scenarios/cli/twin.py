@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from fleet.errors import FleetError
+from fleet.errors import FleetError, distinguish
 from fleet.fields import MAX_SEED, argument, option
 from fleet.job import BOUNDS
 from fleet.robot import POSTURES, RATING
@@ -533,9 +533,8 @@ def follow_log(twins: Path, arm: str | None, log: Path, how: str, skip_damaged: 
                 continue
             parts = feed.add(recording)
             if not parts and (step_s := recording.duration_s / max(len(recording.time_s) - 1, 1)) > GAP_S:
-                raise FleetError(
-                    f"'{log}' has a sample every {step_s:.3g} s; windows need one at least every {GAP_S:g} s."
-                )
+                step, gap = distinguish(step_s, GAP_S, 3)
+                raise FleetError(f"'{log}' has a sample every {step} s; windows need one at least every {gap} s.")
             for row in score_windows(twin, parts):
                 text = window_text(row, how)
                 echo(text if how != "csv" or count == 0 else text.splitlines()[1])

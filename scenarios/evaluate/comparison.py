@@ -61,6 +61,17 @@ class Failed:
     trace: str
     """Last lines of the traceback."""
 
+    @property
+    def text(self) -> str:
+        """The shift and the error."""
+        return f"{self.instance}, fleet {self.fleet}, training {self.training}, seed {self.seed}: {self.error}"
+
+
+def failures_by_policy(failures: Sequence[Failed]) -> list[tuple[str, int, Failed]]:
+    """Each policy that failed, the number of its failures and the first one; the most failures first."""
+    first = {each.policy: each for each in reversed(failures)}
+    return [(policy, count, first[policy]) for policy, count in Counter(each.policy for each in failures).most_common()]
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -135,6 +146,8 @@ class Comparison:
 def figures_table(results: Sequence[Comparison], scores: SuiteScores | None = None) -> Table:
     """Every figure of every policy as a number in its own cell, for a file of a spreadsheet; "" where there is none.
 
+    A policy that failed has its number of failed shifts instead, with the first failure in the last column.
+
     Args:
         scores: Normalised scores over all results; of several results their scenario is "all".
     """
@@ -143,10 +156,18 @@ def figures_table(results: Sequence[Comparison], scores: SuiteScores | None = No
         (
             *(result.scenario, kind.heading, label(policy), label(result.baseline)),
             *_numbers(*(getattr(figures[name], each) for each in names)),
+            "",
         )
         for result in results
         for name, kind in KINDS.items()
         for policy, figures in result.figures.items()
+    ]
+    rows += [
+        (result.scenario, "failed shifts", label(policy), label(result.baseline), str(count))
+        + ("",) * (len(names) - 1)
+        + (f"{first.text}\n{first.trace}".rstrip(),)
+        for result in results
+        for policy, count, first in failures_by_policy(result.failures)
     ]
     if scores:
         where, base = results[0].scenario if len(results) == 1 else "all", label(scores.baseline)
@@ -157,8 +178,8 @@ def figures_table(results: Sequence[Comparison], scores: SuiteScores | None = No
                 if each := getattr(score, field_name):
                     more = of_mean if field_name == "mean" else (np.nan,) * len(of_mean)
                     numbers = _numbers(each.mean, each.low, each.high, *more)
-                    rows.append((where, heading, label(policy), base, *numbers))
-    return Table(head=("scenario", "figure", "policy", "baseline", *names), rows=tuple(rows))
+                    rows.append((where, heading, label(policy), base, *numbers, ""))
+    return Table(head=("scenario", "figure", "policy", "baseline", *names, "first_failure"), rows=tuple(rows))
 
 
 def _numbers(*values: float) -> Iterator[str]:
@@ -170,7 +191,7 @@ def compare(
     scenario: str | Path | Scenario,
     policies: Sequence[str],
     *,
-    seeds: Sequence[int] = range(20),
+    seeds: Sequence[int] | Array = range(20),
     baseline: str | None = None,
     difficulty: str = "twin",
     risk: RiskName = RISK,
@@ -205,6 +226,8 @@ def compare(
         raise FleetError(f"policies must be a list of names, for example ['wspt', 'mine.py:Mine'] (got {policies!r}).")
     for policy in policies:
         check_name(policy)
+    if isinstance(seeds, np.ndarray) and seeds.ndim == 1:
+        seeds = seeds.tolist()
     if isinstance(seeds, str) or not isinstance(seeds, Sequence):
         raise FleetError(f"seeds must be a list of integers, for example range(3) (got {seeds!r}).")
     try:

@@ -15,8 +15,9 @@ import numpy as np
 from fleet.bus.exchange.channel import PERFECT
 from fleet.engine.batch import RewardWeights
 from fleet.engine.observe import PEAK_HIGH_C
-from fleet.errors import FleetError, printable
+from fleet.errors import FleetError, distinguish, printable
 from fleet.files import atomic_path
+from fleet.robot import ThermalLimits
 from fleet.seeding import shift_seeds
 from scenarios.evaluate.references import ShiftReference
 from scenarios.evaluate.rollout import FIGURES, KINDS, Outcome
@@ -38,6 +39,8 @@ MOST_BYTES = 1_000_000
 MOST_TRAININGS = 20
 SLACK = 1e-6
 """By which a reward may exceed an upper bound, as a share, for rounding."""
+SLACK_K = 0.01
+"""By which a temperature may differ from a limit, for rounding."""
 NEEDED = ("python", "thermofleet", "numpy", "numba", "scipy")
 """Versions that a result must state."""
 MOST_FIGURE = 1e9
@@ -178,6 +181,8 @@ def _problems_of_card(submission: BoardResult) -> Iterator[str]:
             f"its policy '{card.policy}' must be built-in and have no hash, or have another name and one "
             "(bus:NAME has none)"
         )
+    elif not card.policy_hash and card.scope != (scope := scope_of(card.policy)):
+        yield f"its scope is {scope}, as that of every `{card.policy}` (got {card.scope})"
     if card.difficulty not in ALL_SOURCES:
         yield f"its predictions are of no source '{card.difficulty}'"
     if card.manifest != manifest_hash(card.split):
@@ -229,32 +234,61 @@ def _problems_of_shift(row: ResultLine, line: ManifestLine, known: ShiftReferenc
     if max(own["above_warning_min"], own["hot_surface_min"]) > longest_min + SLACK:
         yield f"has more minutes above a limit than its arms work ({longest_min:g})"
     limits = _limits_of(line)
-    if not limits.ambient_c - SLACK <= own["peak_c"] <= PEAK_HIGH_C:
-        yield f"has a hottest motor of {own['peak_c']:g} °C, not within {limits.ambient_c:g} to {PEAK_HIGH_C:g}"
-    if own["value"] > limits.value + SLACK * limits.value:
-        yield f"has a finished value of {own['value']:.4g}, but its jobs have {limits.value:.4g}"
+    bound = min(max(own["peak_c"], limits.ambient_c), float(PEAK_HIGH_C))
+    if abs(own["peak_c"] - bound) > SLACK:
+        peak, _ = distinguish(own["peak_c"], bound)
+        yield f"has a hottest motor of {peak} °C, not within {limits.ambient_c:g} to {PEAK_HIGH_C:g}"
+    least, most = limits.value_of(int(own["finished"]))
+    bound = min(max(own["value"], least), most)
+    if abs(own["value"] - bound) > SLACK * most:
+        value, limit = distinguish(own["value"], bound)
+        at = "least" if own["value"] < bound else "most"
+        yield f"has a finished value of {value}, but {own['finished']:g} of its jobs have at {at} {limit}"
     weights = limits.weights
     costs = -weights.faults * own["faults"] - weights.above_warning * own["above_warning_min"]
-    if reward > own["value"] - costs + SLACK * (1 + own["value"] + costs):
+    if reward > (net := own["value"] - costs) + SLACK * (1 + own["value"] + costs):
+        given, bound = distinguish(reward, net)
         yield (
-            f"has a reward of {reward:.4g}, above the finished value {own['value']:.4g} less {costs:.4g} for faults "
-            "and minutes above the warning limit: all else is a cost"
+            f"has a reward of {given}, above {bound}: the finished value {own['value']:.4g} less {costs:.4g} for "
+            "faults and minutes above the warning limit; all else is a cost"
         )
-    if known and reward < (least := known.random - MOST_LOSS * max(known.unit, known.upper - known.random)):
-        yield f"has a reward of {reward:.4g}, below what the worst policy could lose ({least:.4g})"
+    if known and reward < (worst := known.random - MOST_LOSS * max(known.unit, known.upper - known.random)):
+        yield "has a reward of {}, below what the worst policy could lose ({})".format(*distinguish(reward, worst))
     if known and reward > known.upper + SLACK * (1 + abs(known.upper)):
-        yield f"has a reward of {reward:.4g}, above the upper bound {known.upper:.4g}, which no policy exceeds"
+        yield "has a reward of {}, above the upper bound {}, which no policy exceeds".format(
+            *distinguish(reward, known.upper)
+        )
+    yield from _problems_of_heat(own, limits.heat)
+
+
+def _problems_of_heat(own: Mapping[str, float], heat: ThermalLimits) -> Iterator[str]:
+    """What is impossible, as only heat stops arms of the suite."""
+    faults, minutes, peak_c = own["faults"], own["above_warning_min"], own["peak_c"]
+    for what, happened, limit_c in (
+        (f"{faults:g} fault{'s' * (faults != 1)}, which come at", faults > 0, heat.error_c),
+        (f"{minutes:.4g} min above the warning limit of", minutes > 0, heat.warning_c),
+    ):
+        if peak_c < limit_c - SLACK_K if happened else peak_c > limit_c + SLACK_K:
+            peak, limit = distinguish(peak_c, limit_c)
+            yield f"has {what} {limit} °C, but a hottest motor of {peak} °C"
+    if not faults and own["availability"] < 1 - SLACK:
+        yield f"has no faults, but an availability of {own['availability']:.9g}, which only faults lower"
 
 
 @dataclass(frozen=True)
 class _Limits:
-    """What the jobs, the reward and the ambient temperature of an instance allow."""
+    """What the jobs, the reward, and the limits and ambient temperature of an instance allow."""
 
-    value: float
-    """Of all its jobs."""
+    values: tuple[float, ...]
+    """Of its jobs, the least first."""
     weights: RewardWeights
+    heat: ThermalLimits
     ambient_c: float
     """Lowest ambient temperature."""
+
+    def value_of(self, count: int) -> tuple[float, float]:
+        """Least and most value that this number of its jobs can have."""
+        return sum(self.values[:count]), sum(self.values[max(len(self.values) - count, 0) :])
 
 
 @cache
@@ -262,7 +296,8 @@ def _limits_of(line: ManifestLine) -> _Limits:
     made = instance_of(line)
     jobs = draw_jobs(made.scenario, shift_seeds(np.random.SeedSequence(made.seed))[0])
     coolest_c = min(ambient_c for _, ambient_c in made.scenario.ambient.points)
-    return _Limits(sum(job.value for job in jobs), weights_of(made.scenario), coolest_c)
+    values = tuple(sorted(job.value for job in jobs))
+    return _Limits(values, weights_of(made.scenario), made.scenario.limits, coolest_c)
 
 
 def write(submission: BoardResult, folder: Path) -> Path:

@@ -12,13 +12,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from agents.learned.cards import check_recipe
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError, nearest
 from fleet.fields import MAX_SEED
 from fleet.seeding import child
 from scenarios.evaluate.rollout import FIGURES, DecisionLimit, Outcome, TooSlow
 from scenarios.evaluate.sources import ALL_SOURCES, check_source, drawn, is_trained, preparations
-from scenarios.policy_loader import is_on_bus, label, policy_of, source_of, trainings_of
+from scenarios.policy_loader import OWN_PACKAGES, is_on_bus, label, policy_of, source_of, trainings_of
 from scenarios.prepare.randomisation import Randomisation, randomisation_of
 from scenarios.run.log import code_hash, versions_of
 from scenarios.spec.load import INSTANCE, SPLITS, library, load
@@ -31,8 +32,6 @@ CARD = "study.json"
 """File of a study with its plan, in the folder of its results."""
 TOGETHER = 16
 """Shifts of a policy that are stepped side by side."""
-OWN_PACKAGES = ("fleet", "agents", "twin", "scenarios", "thermofleet")
-"""Covered by the hash of the code."""
 _LIBRARIES = ("thermofleet", "numpy", "numba", "scipy", "mujoco", "torch")
 
 
@@ -158,6 +157,8 @@ class Study(StudySpec):
         for policy, own in self.own_trainings.items():
             for each in own:
                 check_policy(each, self.decision_limit_s)
+            if len(own) > 1:
+                check_recipe(policy, [source for each in own if (source := source_of(each))])
             if len(own) > 1 and (self.trainings > 1 or self.fleets > 1):
                 raise FleetError(f"'{policy}' has {len(own)} trainings: then --trainings and --fleets must be 1.")
             if len(own) not in (1, self.most_trainings):
@@ -310,13 +311,13 @@ def files_of(source: Path) -> list[Path]:
     """All files of a folder; or a file, and what it imports from its folder, its package and the working directory."""
     if source.is_dir():
         return sorted(path for path in source.rglob("*") if path.is_file())
-    root = source.absolute().parent
+    root = folder = source.absolute().parent
     while (root / "__init__.py").is_file():
         root = root.parent
     inside = source.absolute().relative_to(root)
     if "site-packages" in root.parts:
         return sorted((root / inside.parts[0]).rglob("*.py")) or [source]
-    finder = ModuleFinder([str(root), str(Path.cwd())], excludes=OWN_PACKAGES)
+    finder = ModuleFinder([str(folder), str(root), str(Path.cwd())], excludes=OWN_PACKAGES)
     try:
         if len(inside.parts) == 1:
             finder.run_script(str(source))

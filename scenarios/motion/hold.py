@@ -10,7 +10,7 @@ from typing import cast, get_args
 import msgspec
 import numpy as np
 
-from fleet.errors import FleetError, nearest
+from fleet.errors import FleetError, distinguish, nearest
 from fleet.heat.motor import Motors, current, gen3_motors, thermal_data
 from fleet.heat.thermal import (
     HOUSING,
@@ -217,9 +217,10 @@ def as_table(result: HoldResult) -> Table:
 def _check_torque(tau: Array, payload_kg: float, posture: str) -> None:
     clip = np.array(GEN3.torque_clip)
     for j in np.flatnonzero(np.abs(tau) > clip):
+        needed, most = distinguish(abs(tau[j]), clip[j])
         raise HoldError(
-            f"Holding {payload_kg:g} kg in posture '{posture}' takes {abs(tau[j]):.1f} N·m at joint {j + 1}; "
-            f"its motor gives at most {clip[j]:g} N·m."
+            f"Holding {payload_kg:g} kg in posture '{posture}' takes {needed} N·m at joint {j + 1}; its motor gives at "
+            f"most {most} N·m."
         )
 
 
@@ -230,12 +231,13 @@ def _note(tau: Array, course: Course, load_kg: float, reach_m: float) -> str:
     ]
     continuous_kg = RATING.allowed_kg(reach_m, np.inf)
     if load_kg > continuous_kg:
-        sentences.append(
-            f"{load_kg:g} kg at {reach_m:.2f} m reach is above the continuous rating of {continuous_kg:.1f} kg."
-        )
+        load, rating = distinguish(load_kg, continuous_kg, 3)
+        sentences.append(f"{load} kg at {reach_m:.2f} m reach is above the continuous rating of {rating} kg.")
     warning = np.array(GEN3.torque_warning)
     sentences += [
-        f"Joint {j + 1} needs {abs(tau[j]):.1f} N·m, above the arm's torque warning of {warning[j]:g} N·m."
+        "Joint {} needs {} N·m, above the arm's torque warning of {} N·m.".format(
+            j + 1, *distinguish(abs(tau[j]), warning[j])
+        )
         for j in np.flatnonzero(np.abs(tau) > warning)
     ]
     if course.steady_c[0] is None:

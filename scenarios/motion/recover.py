@@ -30,7 +30,7 @@ import pyarrow.parquet as pq
 from fleet.arm.model import ArmModel
 from fleet.arm.random_motions import plan_motion
 from fleet.engine.world import Arm
-from fleet.errors import FleetError, InfeasibleJob, nearest
+from fleet.errors import FleetError, InfeasibleJob, distinguish, nearest
 from fleet.files import cache_folder
 from fleet.heat.motor import Motors
 from fleet.heat.thermal import (
@@ -437,9 +437,10 @@ def hold_until(
     for temp_c in temperature_steps(repeat(load, round(most_s / TICK_S)), TICK_S, **alike):
         if temp_c[WINDING].max() >= until_c:
             return temp_c
+    hottest, until = distinguish(float(temp_c[WINDING].max()), until_c)
     raise RecoveryError(
         f"Arm '{arm.robot.name}' does not get warm: holding {payload_kg:g} kg there for {most_s / 60:g} min heats its "
-        f"hottest motor to {temp_c[WINDING].max():.1f} °C, less than {until_c:g} °C. There is nothing to recover from."
+        f"hottest motor to {hottest} °C, less than {until} °C. There is nothing to recover from."
     )
 
 

@@ -19,7 +19,7 @@ from fleet.arm.plan_cache import CachedPlanner, LoadedPlans, rest_torque
 from fleet.arm.space import FARTHEST_M, collisions_of_homes, conflicts_with_homes
 from fleet.difficulty import Blind
 from fleet.engine.world import Arm, warm_start
-from fleet.errors import InfeasibleJob
+from fleet.errors import InfeasibleJob, distinguish
 from fleet.heat.motor import Motors, gen3_motors, thermal_data
 from fleet.heat.thermal import WINDING, ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
 from fleet.job import Work
@@ -236,8 +236,9 @@ def _outside_limits_at_home(scenario: Scenario, arms: Sequence[PlannedArm], fold
         if coldest_c < lower_c:
             advice = "give it warmer air" + (', or begin with start = "idle_warm"' if scenario.start == "cold" else "")
             name = scenario.arms[arm.index].name
+            coldest, lower = distinguish(coldest_c, lower_c)
             problems.append(
-                f"arms[{arm.index}]: a motor of '{name}' begins at {coldest_c:.1f} °C, below limits.lower_c "
-                f"({lower_c:g} °C); {advice}"
+                f"arms[{arm.index}]: a motor of '{name}' begins at {coldest} °C, below limits.lower_c ({lower} °C); "
+                f"{advice}"
             )
     return problems

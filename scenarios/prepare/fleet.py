@@ -20,7 +20,7 @@ from fleet.engine.profile_plant import ProfilePlant
 from fleet.engine.tables import Tables
 from fleet.engine.world import Arm, World, build_world, warm_start
 from fleet.env.lookahead import CellSimulator
-from fleet.errors import FleetError, InfeasibleJob, ScenarioError
+from fleet.errors import FleetError, InfeasibleJob, ScenarioError, distinguish
 from fleet.fields import check_instance
 from fleet.files import cache_folder
 from fleet.job import Job, Work
@@ -247,9 +247,10 @@ def unfinishable_jobs(scenario: Scenario, arms: Sequence[PlannedArm]) -> Iterato
         unit = next((name for name, s in (("minutes", 60.0), ("hours", 3600.0)) if s * left_s >= needed_s), "")
         if stream.row and not any(time_s % 60.0 for time_s in (*(spec.times_s or ()), stream.due_s)):
             unit = ""
+        needed, left = distinguish(needed_s, left_s)
         yield (
-            f"{scenario.name}.toml: {place}: '{stream.name}' takes at least {needed_s:.4g} s ({cycles} "
-            f"cycle{'s' * (cycles > 1)}), but has {left_s:.4g} s until {until}."
+            f"{scenario.name}.toml: {place}: '{stream.name}' takes at least {needed} s ({cycles} "
+            f"cycle{'s' * (cycles > 1)}), but has {left} s until {until}."
             f"{unit and f' Are its times {unit}? Give seconds.'}"
         )
 

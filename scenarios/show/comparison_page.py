@@ -1,6 +1,5 @@
 """A comparison as text, and as one HTML file that opens offline: verdict, intervals, charts and its command."""
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,7 +9,7 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from scenarios.evaluate.comparison import Comparison, Failed, by_reward
+from scenarios.evaluate.comparison import Comparison, by_reward, failures_by_policy
 from scenarios.evaluate.scores import FEWEST, HEADS, Normalised, SuiteScores, ranked, score_cells, scores_of
 from scenarios.evaluate.statistics import LEGEND, LEVEL, Interval, profile
 from scenarios.policy_loader import is_on_bus, label
@@ -65,13 +64,9 @@ def result_text(result: Comparison) -> Group:
 def _failures(results: Sequence[Comparison]) -> list[tuple[str, str]]:
     """Number of failures of each policy and its first one, a sentence and a traceback; the most failures first."""
     failures = [each for result in results for each in result.failures]
-    first = {each.policy: each for each in reversed(failures)}
     return [
-        (
-            f"{label(policy)} failed in {count} shift{'s' * (count > 1)}, first in {_failure_text(first[policy])}",
-            first[policy].trace,
-        )
-        for policy, count in Counter(each.policy for each in failures).most_common()
+        (f"{label(policy)} failed in {count} shift{'s' * (count > 1)}, first in {first.text}", first.trace)
+        for policy, count, first in failures_by_policy(failures)
     ]
 
 
@@ -346,10 +341,6 @@ def _heat_chart(result: Comparison, number: int, numbers: Mapping[str, int]) -> 
     drawn = points(rows, numbers, "hottest motor, °C, mean over shifts", "value of finished jobs, mean over shifts")
     alt = f"value of finished jobs against the hottest motor of {', '.join(figures)}"
     return Chart(key=f"heat_{number}", figure=drawn, alt=alt) if rows else None
-
-
-def _failure_text(each: Failed) -> str:
-    return f"{each.instance}, fleet {each.fleet}, training {each.training}, seed {each.seed}: {each.error}"
 
 
 def _origin(judged: Judged) -> Table:

@@ -7,7 +7,7 @@ from typing import Any  # a mesh of trimesh
 
 import numpy as np
 
-from fleet.errors import ScenarioError, printable
+from fleet.errors import ScenarioError, distinguish, printable
 from fleet.job import LEAST_FIXTURE_M, MOST_FIXTURE_M, Fixture
 from fleet.robot import rotation
 from fleet.surface import surface_of
@@ -86,7 +86,8 @@ def _read(file: Path, where: str) -> Any:
     if not file.is_file():
         raise ScenarioError(f"{where}: there is no such file. Paths are relative to the scenario file.")
     if (size := file.stat().st_size) > MOST_BYTES:
-        raise ScenarioError(f"{where} has {size / 1e6:.0f} MB; at most {MOST_BYTES / 1e6:.0f} are allowed.")
+        given, most = distinguish(size / 1e6, MOST_BYTES / 1e6)
+        raise ScenarioError(f"{where} has {given} MB; at most {most} are allowed.")
     _check_content(file.read_bytes(), ending, where)
     try:
         mesh: Any = model_solid(file) if ending in MODELS else trimesh.load_scene(file, process=False).to_mesh()

@@ -21,7 +21,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import msgspec
 import numpy as np
 
-from fleet.errors import ScenarioError, listed, nearest, printable
+from fleet.errors import ScenarioError, distinguish, listed, nearest, printable
 from scenarios.spec.calendar import check_breaks, with_calendar, zone_of
 from scenarios.spec.job_table import cycle_of, read_bytes, read_job_table, shift_begin, stream_fields, text_of
 from scenarios.spec.mesh_file import with_meshes
@@ -327,11 +327,12 @@ def _check(scenario: Scenario, path: Path) -> None:
         if errors and kind != "jobs":
             raise ScenarioError(f"{file}: {errors[0]}")
     for (i, one), (j, other) in combinations(enumerate(scenario.arms), 2):
-        apart = dist(one.position_m, other.position_m)
-        if apart < APART_M:
+        apart_m = dist(one.position_m, other.position_m)
+        if apart_m < APART_M:
+            given, least = distinguish(apart_m, APART_M, 2)
             raise ScenarioError(
-                f"{file}: arms[{j}].position_m: '{other.name}' is {apart:.2f} m from '{one.name}' (arms[{i}]); "
-                f"bases must be at least {APART_M} m apart."
+                f"{file}: arms[{j}].position_m: '{other.name}' is {given} m from '{one.name}' (arms[{i}]); "
+                f"bases must be at least {least} m apart."
             )
     places = {place.name: place.position_m for place in scenario.places}
     streams = [stream.name for stream in scenario.jobs]
@@ -375,9 +376,8 @@ def _check(scenario: Scenario, path: Path) -> None:
             )
     total = sum(stream.arrivals.expected(scenario.horizon_s) for stream in scenario.jobs)
     if total > MOST_JOBS:
-        raise ScenarioError(
-            f"{file}: jobs: about {total:.3g} jobs would arrive in a shift; at most {MOST_JOBS} are allowed."
-        )
+        count, most = distinguish(total, MOST_JOBS, 6)
+        raise ScenarioError(f"{file}: jobs: about {count} jobs would arrive in a shift; at most {most} are allowed.")
 
 
 def _check_intervals(scenario: Scenario, file: str) -> None:

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from agents.learned.cards import OPTION_OF, POLICIES, settings_of
 from agents.learned.config import TrainingLength
 from agents.learned.evolution import CURVE, TrainingLog, read_log
 from fleet.errors import FleetError
@@ -17,11 +18,7 @@ from scenarios.progress import Progress, quiet
 
 TRAINING = "training.json"
 """Settings that a resume must repeat; written after the first state, so that a folder with it can be resumed."""
-OPTION_OF = {"prepared": "--instances", "judges": "--validation-instances", "algorithm": "--algo"}
-"""Options of `thermofleet train` whose setting has another name in a card."""
 PAIRS_STATE, NETWORK_STATE = "training.npz", "training.pt"
-POLICIES = ("pairs.json", "policy.json")
-"""Cards of trained policies (`agents.learned.policy.CARD` needs PyTorch)."""
 
 
 class Learner(Protocol):
@@ -173,7 +170,7 @@ def check_folder(out: Path, card: Mapping[str, Any], state: str, *, resume: bool
         raise FleetError(f"'{out / TRAINING}' is damaged ({error}); the training cannot be resumed.") from error
     if not isinstance(before, dict):
         raise FleetError(f"'{out / TRAINING}' is damaged (no JSON object); the training cannot be resumed.")
-    was, now = (each | each.get("config", {}) | {"config": None} for each in (before, json.loads(json.dumps(card))))
+    was, now = settings_of(before), settings_of(json.loads(json.dumps(card)))
     for name, value in now.items():
         if was.get(name) != value:
             shown = OPTION_OF.get(name, name)

@@ -375,6 +375,22 @@ def test_an_exported_figure_is_a_number_and_a_name_is_no_formula(study: Study):
     assert table.content(".csv").decode().count("\n") == 1 + len(table.rows)
 
 
+def test_an_export_names_the_first_failure_of_a_policy(study: Study):
+    rows = [
+        replace(row, outcome=None, error=f"Oops: {row.key.seed}", trace="line 7") if row.key.policy == "wspt" else row
+        for row in rows_of(study)
+    ]
+    (result,) = judged(study, rows, {}).results
+    head, *lines = csv.reader(io.StringIO(figures_table([result]).csv()))
+    cells = [dict(zip(head, line, strict=True)) for line in lines]
+    (failed,) = [each for each in cells if each["policy"] == "wspt"]
+    first = result.failures[0]
+    assert failed["figure"] == "failed shifts"
+    assert int(failed["mean"]) == len(result.failures) == sum(row.error is not None for row in rows)
+    assert failed["first_failure"] == f"{first.instance}, fleet 0, training 0, seed {first.seed}: {first.error}\nline 7"
+    assert {each["first_failure"] for each in cells if each["policy"] != "wspt"} == {""}
+
+
 def test_an_export_has_the_normalised_scores_of_the_page(study: Study):
     of_all = judged(study, rows_of(study), KNOWN_SHIFTS)
     assert of_all.scores is not None
@@ -541,3 +557,8 @@ def test_bad_sources_are_named(thermofleet, small_toml) -> None:
     assert thermofleet("compare", small_toml, "--policies", "wspt,wspt@blind", "--difficulty", "blind").refused(
         "The policy 'wspt@blind' is given twice"
     )
+
+
+@pytest.mark.parametrize("names", [",", "wspt,,fifo", "wspt,", ""])
+def test_an_empty_name_is_told(thermofleet, small_toml, names) -> None:
+    assert thermofleet("compare", small_toml, "--policies", names).refused(f"A name is empty in '{names}'.")

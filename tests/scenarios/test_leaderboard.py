@@ -4,13 +4,16 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import astuple, replace
+from functools import cache
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 
 from docs.tables import board_text
 from fleet.errors import FleetError
+from fleet.seeding import shift_seeds
 from scenarios.evaluate import leaderboard
 from scenarios.evaluate.leaderboard import (
     MOST_BYTES,
@@ -28,9 +31,23 @@ from scenarios.evaluate.rollout import FIGURES, Outcome
 from scenarios.evaluate.store import opened
 from scenarios.evaluate.study import Row, Study, suite_of
 from scenarios.policy_loader import policy_of, scope_of
-from scenarios.suite.splits import manifest
+from scenarios.spec.jobs import draw_jobs
+from scenarios.suite.splits import instance_of, manifest
 
-BLANK = Outcome(**dict.fromkeys(FIGURES, 0.0) | {"value": 50.0, "peak_c": 60.0})
+BLANK = Outcome(
+    **dict.fromkeys(FIGURES, 0.0) | {"value": 691.19, "finished": 166.0, "peak_c": 50.0, "availability": 1.0}
+)
+"""As if all jobs of `test/0007` were finished."""
+
+
+@cache
+def blank(instance: str, reward: float) -> Outcome:
+    """A shift without heat in which all jobs are finished."""
+    (line,) = [each for each in manifest("test") if each.name == instance]
+    value = sum(
+        job.value for job in draw_jobs(instance_of(line).scenario, shift_seeds(np.random.SeedSequence(line.seed))[0])
+    )
+    return replace(BLANK, reward=reward, value=value, finished=float(line.count))
 
 
 def reference(line) -> ShiftReference:
@@ -57,7 +74,7 @@ def study() -> Study:
 def finished(study: Study, out: Path, rewards: dict[str, float], failed: int = 0) -> Path:
     """The folder of a study without running it; wsept fails in the first shifts."""
     keys = [key for unit in study.units(set()) for key in unit.keys]
-    rows = [Row(key, replace(BLANK, reward=rewards[key.policy])) for key in keys]
+    rows = [Row(key, blank(key.instance, rewards[key.policy])) for key in keys]
     with opened(out, study.card) as store:
         for n, row in enumerate(row for row in rows if row.key.policy == "wsept"):
             if n < failed:
@@ -139,12 +156,55 @@ FORGED = {
     "more jobs than there are": (changed(7, finished=1e4), "test/0007 has 10000 finished jobs"),
     "the name of a rule": (changed(None, policy="wsept"), "must be built-in and have no hash"),
     "code of its author": (changed(None, policy="this:x", policy_hash=""), "must be built-in and have no hash"),
-    "another process": (changed(None, policy="bus:mine", policy_hash=""), None),
+    "another process": (changed(None, policy="bus:mine", policy_hash="", scope="central"), None),
+    "a built-in policy": (changed(None, policy="wspt", policy_hash="", scope="central"), None),
+    "another scope": (changed(None, policy="wsept", policy_hash=""), "scope is central, as that of every `wsept`"),
+    "the scope of another process": (
+        changed(None, policy="bus:m", policy_hash=""),
+        r"scope is central, .* \(got arm\)",
+    ),
     "files of another process": (changed(None, policy="bus:mine"), r"\(bus:NAME has none\)"),
-    "more than the value": (changed(7, value=11.9), r"test/0007 has a reward of 12, above the finished value 11\.9"),
-    "more value than its jobs have": (changed(7, value=1e6), r"has a finished value of 1e\+06, but its jobs have \d"),
-    "faults without their price": (changed(7, faults=1e6), "above the finished value 50 less .* for faults"),
-    "minutes without their price": (changed(7, above_warning_min=1e3), "above the finished value 50 less 50 for"),
+    "hardly more than the bound": (
+        changed(7, reward=40.0 + 1e-4),
+        r"test/0007 has a reward of 40\.0001, above the upper bound 40,",
+    ),
+    "more than the value": (
+        changed(7, value=11.9, finished=3),
+        r"test/0007 has a reward of 12, above 11\.9: the finished value 11\.9 less 0 for",
+    ),
+    "more value than its jobs have": (changed(7, value=1e6), r"of 1e\+06, but 166 of its jobs have at most 691\.2"),
+    "more value than so few jobs have": (
+        changed(7, finished=1),
+        r"has a finished value of 691\.2, but 1 of its jobs have at most 5\.09",
+    ),
+    "less value than so many jobs have": (
+        changed(7, value=0.0),
+        r"has a finished value of 0, but 166 of its jobs have at least 691\.2",
+    ),
+    "faults without their price": (changed(7, faults=1e6), r"the finished value 691\.2 less .* for faults"),
+    "minutes without their price": (changed(7, above_warning_min=1.5e4), r"value 691\.2 less 750 for faults"),
+    "no fault, above the limit": (
+        changed(7, peak_c=80.0),
+        "test/0007 has 0 faults, which come at 59 °C, but a hottest motor of 80 °C",
+    ),
+    "faults below the limit": (
+        changed(7, faults=2.0),
+        "has 2 faults, which come at 59 °C, but a hottest motor of 50 °C",
+    ),
+    "faults hardly below the limit": (
+        changed(7, faults=1.0, peak_c=58.98),
+        r"has 1 fault, which come at 59 °C, but a hottest motor of 58\.98 °C",
+    ),
+    "a fault": (changed(7, faults=1.0, peak_c=59.0, above_warning_min=1.0, availability=0.9), None),
+    "minutes above the warning limit, below it": (
+        changed(7, above_warning_min=1.0),
+        "has 1 min above the warning limit of 52 °C, but a hottest motor of 50 °C",
+    ),
+    "no minute above the warning limit, above it": (
+        changed(7, peak_c=53.0),
+        "has 0 min above the warning limit of 52 °C, but a hottest motor of 53 °C",
+    ),
+    "lost time without a fault": (changed(7, availability=0.927), r"has no faults, but an availability of 0\.927,"),
     "no number": (changed(7, value=float("nan")), "needs 11 figures of at most 1e\\+09"),
     "below 0": (changed(7, faults=-1.0), "a figure below 0"),
     "half a fault": (changed(7, faults=0.5), "counts that are no whole numbers"),
@@ -165,10 +225,9 @@ def good(study: Study) -> BoardResult:
         manifest=leaderboard.manifest_hash("test"), code_hash="a" * 16, policy_hash="c" * 16, risk="rc",
         versions=versions,
     )  # fmt: skip
-    figures = [*astuple(replace(BLANK, reward=12.0))]
     rows = [
-        ResultLine(instance=case.name, scenario=scenarios[case.name], seed=case.seeds[0], training=0, figures=figures,
-               illegal=0)
+        ResultLine(instance=case.name, scenario=scenarios[case.name], seed=case.seeds[0], training=0,
+               figures=[*astuple(blank(case.name, 12.0))], illegal=0)
         for case in study.cases
     ]  # fmt: skip
     return BoardResult(card=card, rows=tuple(rows))

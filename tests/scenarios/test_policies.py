@@ -1,6 +1,9 @@
 """Policies by name, from own files and modules; one that fails is named in one sentence."""
 
+import sys
 import time
+from pathlib import Path
+from types import ModuleType
 from typing import ClassVar
 
 import numpy as np
@@ -73,6 +76,45 @@ def test_an_own_class_from_a_file_or_a_module(own):
     assert type(made[0]).__name__ == "Idle"
     assert scope_of(f"{own}:make") == "central"
     assert isinstance(arm_policy_of("agents.rules:LeastDifficulty"), LeastDifficulty)
+
+
+def in_folder(folder: Path, action: int) -> str:
+    """A policy whose action is in a module beside it."""
+    folder.mkdir(exist_ok=True)
+    (folder / "helper.py").write_text(f"import deeper.inner\nACTION = {action} + deeper.inner.ZERO\n")
+    (folder / "deeper").mkdir(exist_ok=True)
+    (folder / "deeper" / "__init__.py").touch()
+    (folder / "deeper" / "inner.py").write_text("ZERO = 0\n")
+    (folder / "calendar.py").write_text("raise ValueError('not that of the standard library')\n")
+    (folder / "fleet.py").write_text("raise ValueError('not that of the project')\n")
+    (folder / "own.py").write_text(
+        "from __future__ import annotations\nimport calendar\nfrom dataclasses import dataclass\n"
+        "from typing import ClassVar\nfrom fleet.job import Job\nfrom helper import ACTION\n@dataclass\nclass Own:\n"
+        " scope: ClassVar[str] = 'central'\n def reset(self, rng): ...\n def act(self, o): return {'a': ACTION}\n"
+    )
+    return f"{folder / 'own.py'}:Own"
+
+
+def test_a_file_imports_modules_beside_it_and_never_those_of_another_folder(tmp_path, monkeypatch):
+    names = [in_folder(tmp_path / folder, action) for folder, action in (("one", 1), ("two", 2))]
+    elsewhere = ModuleType("helper")
+    monkeypatch.setitem(sys.modules, "helper", elsewhere)
+    in_folder(tmp_path / "three", 3)
+    (tmp_path / "three" / "fleet.py").unlink()
+    (tmp_path / "three" / "calendar.py").unlink()
+    monkeypatch.syspath_prepend(tmp_path / "three")
+    path = list(sys.path)
+    actions = [policy_of(name).act({}) for name in (*names, *names)]
+    assert actions == [{"a": 1}, {"a": 2}] * 2
+    in_folder(tmp_path / "one", 1000)
+    assert [policy_of(name).act({}) for name in names] == [{"a": 1000}, {"a": 2}]
+    assert (sys.modules["helper"], sys.path) == (elsewhere, path)
+    assert "deeper" not in sys.modules
+    (tmp_path / "one" / "helper.py").unlink()
+    monkeypatch.delitem(sys.modules, "helper")
+    sys.path.remove(str(tmp_path / "three"))
+    with pytest.raises(FleetError, match=r"ModuleNotFoundError in line 6: No module named 'helper'\.$"):
+        policy_of(names[0])
 
 
 @pytest.mark.parametrize(

@@ -58,7 +58,7 @@ def test_a_shift_and_a_comparison_from_the_file_of_a_scenario(small_toml, plans,
     assert (again.metrics, again.reward, len(again.events)) == (shift.metrics, shift.reward, len(shift.events))
     assert "<" in shift._repr_html_()
     assert repr(shift) == f"<RunLog of {shift.scenario.name}, round_robin, seed 3: reward {shift.reward:.1f}>"
-    seeds: Any = [0, np.int64(1)]
+    seeds: Any = np.arange(2)
     result = tf.compare(small_toml, ["round_robin", "wspt"], seeds=seeds, difficulty="blind", workers=1)
     assert [type(seed) for seed in result.seeds] == [int, int]
     assert result.baseline == "round_robin"
@@ -80,6 +80,9 @@ class Mine:
         ),
         (lambda: tf.compare("quickstart", ["wsept"], seeds=[0, 1, 0]), "Seed 0 is given twice"),
         (lambda: tf.compare("quickstart", ["wsept"], seeds=[1.5]), r"seed must be an integer from 0 to \d+ \(got 1.5"),  # pyright: ignore
+        (lambda: tf.compare("quickstart", ["wsept"], seeds=np.array([0.0])), r"seed must be an integer .* \(got 0\.0"),
+        (lambda: tf.compare("quickstart", ["wsept"], seeds=np.array(3)), r"list of integers"),
+        (lambda: tf.compare("quickstart", ["wsept"], seeds=[0, np.int64(0)]), "Seed 0 is given twice"),
         (lambda: tf.compare("quickstart", ["wsept"], seeds=3), r"list of integers, for example range\(3\) \(got 3\)"),  # pyright: ignore
         (lambda: tf.run("quickstart", policy=Mine), "A policy is given by name"),
         (lambda: tf.run("quickstart", seed=1.5), r"^seed must be an integer \(got 1.5\)"),

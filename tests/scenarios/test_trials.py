@@ -24,6 +24,7 @@ from scenarios.processes import Queue
 from scenarios.show.comparison_page import Judged, verdict
 from scenarios.spec.parse import override
 from scenarios.spec.schema import Scenario
+from tests.own_policies import IDLE
 
 
 def study_of(scenario: Scenario, *policies: str, seeds: int = 3, **more) -> Study:
@@ -233,6 +234,24 @@ def test_a_policy_is_another_one_when_what_it_imports_has_changed(tmp_path, monk
         assert policy_hash(policy)  # what cannot be loaded is told elsewhere
 
 
+def test_a_worker_gives_every_policy_the_modules_beside_it(scenario, plans, tmp_path):
+    """Of two policies of one worker process, whose helpers have one name, one waits and the other one works."""
+    for folder, base in (("idle", "Idle"), ("busy", "Fifo")):
+        (tmp_path / folder).mkdir()
+        text = IDLE if base == "Idle" else "from agents.rules import Fifo\n"
+        (tmp_path / folder / "helper.py").write_text(text, encoding="utf-8")
+        (tmp_path / folder / "own.py").write_text(f"from helper import {base} as {base}Own\n", encoding="utf-8")
+    own = [f"{tmp_path / 'idle' / 'own.py'}:IdleOwn", f"{tmp_path / 'busy' / 'own.py'}:FifoOwn"]
+    rows = runner.run_study(study_of(scenario, *own, "fifo", seeds=1), cache_dir=plans, workers=1)
+    idle, busy, fifo = (row.outcome for row in rows)
+    assert idle is not None
+    assert idle.finished == 0
+    assert busy == fifo
+    hashes = [policy_hash(each) for each in own]
+    (tmp_path / "busy" / "helper.py").write_text("from agents.rules import Edd as Fifo\n", encoding="utf-8")
+    assert [policy_hash(each) == before for each, before in zip(own, hashes, strict=True)] == [True, False]
+
+
 @pytest.mark.ci_slow
 def test_a_policy_that_catches_every_alarm_ends_with_its_process():
     code = """
@@ -340,9 +359,27 @@ def test_folders_of_trainings_are_one_policy(scenario, plans, tmp_path):
         ({"fleets": 2}, "then --trainings and --fleets must be 1"),
         ({"policies": [every, str(tmp_path / "pairs-1*")]}, "has 2 trainings, another policy 3: give as many"),
         ({"policies": [str(tmp_path / "none-*")]}, "There is no folder"),
+        ({"policies": [str(tmp_path / "none-?")]}, "There is no folder"),
     ):
         with pytest.raises(FleetError, match=said):
             study_of(scenario, **({"policies": ["wsept", every]} | given))
+
+
+def test_trainings_of_one_pattern_differ_in_their_seed_alone(scenario, tmp_path):
+    recipe = {"suite": "train", "config": {"learning_rate": 0.02, "seed": 0}, "prepared": 48}
+    for k, changed in enumerate(
+        ({}, {"config": {"learning_rate": 0.02, "seed": 1}, "validation": 0.5, "iterations": 7}, {"prepared": 12})
+    ):
+        save_pairs(np.zeros(PARAMETERS), tmp_path / f"pairs-{k}", **(recipe | changed))
+    assert study_of(scenario, str(tmp_path / "pairs-[01]*")).most_trainings == 2
+    every = f"limited:{tmp_path / 'pairs-?'}"
+    with pytest.raises(FleetError, match=r"pairs-0' has --instances = 48, '.*pairs-2' 12\. Give a pattern for each"):
+        study_of(scenario, every)
+    save_pairs(np.zeros(PARAMETERS), tmp_path / "pairs-2", **(recipe | {"config": {"learning_rate": 0.1, "seed": 2}}))
+    with pytest.raises(FleetError, match=r"differ in more than their seed: .* has learning_rate = 0\.02, '.*-2' 0\.1"):
+        study_of(scenario, every)
+    save_pairs(np.zeros(PARAMETERS), tmp_path / "pairs-2", **recipe)
+    assert study_of(scenario, every).most_trainings == 3
 
 
 def test_seeds_of_instances_are_their_own():

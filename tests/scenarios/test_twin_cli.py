@@ -272,7 +272,7 @@ def test_an_identified_arm_is_told_whole_with_its_air_and_its_place_and_is_not_r
     assert json.loads(thermofleet("twin", "identify", "--log", tmp_path / "monday.csv", "--json").out)["doubts"] == []
     before = (tmp_path / "rc" / "rc.json").read_bytes()
     assert thermofleet(*identify, "--ambient", 55, "--overwrite").refused(
-        "has a motor at 30.0 °C, below the ambient temperature of 55 °C"
+        "has a motor at 30 °C, below the ambient temperature of 55 °C"
     )
     assert thermofleet(*identify, "--ambient", 25).refused(
         "rc.json' exists; give another --out, or --overwrite to replace it."

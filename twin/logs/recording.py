@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from fleet import readings
-from fleet.errors import FleetError, IdentificationError
+from fleet.errors import FleetError, IdentificationError, distinguish
 from fleet.heat.motor import Motors, friction_heat, reference_current
 from fleet.robot import half_turn
 
@@ -182,9 +182,10 @@ def stretches(recording: Recording, rate_hz: float, *, gap_s: float = GAP_S) -> 
     if not gap_s > 0:
         raise ValueError(f"gap_s must be > 0 (got {gap_s}).")
     if len(steps) and np.median(steps) > gap_s:
+        step, gap = distinguish(float(np.median(steps)), gap_s, 3)
         raise ValueError(
-            f"Recording '{recording.name}' has a sample every {np.median(steps):.3g} s, so gap_s={gap_s:g} would drop "
-            "all of it; give a larger gap_s."
+            f"Recording '{recording.name}' has a sample every {step} s, so gap_s={gap} would drop all of it; give a "
+            "larger gap_s."
         )
     pieces = np.split(np.arange(len(recording.time_s)), np.flatnonzero(steps > gap_s) + 1)
     resampled = list[Stretch]()
@@ -278,9 +279,10 @@ def cool_stretches(
     if not long:
         longest_s = max(len(s.time_s) for s in cool_parts) / rate_hz
         what = "The recording" if whole else "The part that stays cool"
+        least, longest = distinguish(least_s, longest_s)
         raise NothingCool(
-            f"{what} is shorter than one window: {least_s:.4g} s are needed, the longest stretch has {longest_s:.4g} "
-            "s. Record for longer, or choose a smaller window (--window)."
+            f"{what} is shorter than one window: {least} s are needed, the longest stretch has {longest} s. Record "
+            "for longer, or choose a smaller window (--window)."
         )
     return long
 

@@ -15,7 +15,7 @@ from itertools import cycle, islice, pairwise
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-from fleet.errors import FleetError
+from fleet.errors import FleetError, distinguish
 from fleet.fields import MAX_SEED, check_instance, check_value
 from fleet.heat.motor import Motors, magnet_factor
 from fleet.heat.thermal import HOUSING, WINDING, temperature_steps
@@ -199,7 +199,8 @@ def forecast(
     cycle_s = plan.duration_s
     run_s = repetitions * cycle_s
     if run_s > MOST_S:
-        raise FleetError(f"The run takes {run_s / 3600:.0f} h; at most {MOST_S / 3600:.0f} h can be forecast.")
+        hours, most = distinguish(run_s / 3600, MOST_S / 3600)
+        raise FleetError(f"The run takes {hours} h; at most {most} h can be forecast.")
     problem = Problem([log], ambient_c, 0.0, vector, _noise(log, vector))
     problem.relative_sd = OBSERVED
     likely, rng = solve(problem, vector.mean), np.random.default_rng(np.random.SeedSequence(seed))
@@ -301,9 +302,10 @@ def _cycle_of(plan: Recording, motors: Motors) -> HeatLog:
         )
     gap = int(np.diff(plan.time_s).argmax())
     if len(logs) != 1 or len(logs[0].time_s) != len(plan.time_s):
+        length, most = distinguish(plan.time_s[gap + 1] - plan.time_s[gap], HEAT_GAP_S)
         raise FleetError(
-            f"The plan '{plan.name}' has a gap of {plan.time_s[gap + 1] - plan.time_s[gap]:.4g} s after "
-            f"{plan.time_s[gap]:.6g} s; at most {HEAT_GAP_S:g} s are allowed, as its heat is unknown."
+            f"The plan '{plan.name}' has a gap of {length} s after {plan.time_s[gap]:.6g} s; at most {most} s are "
+            "allowed, as its heat is unknown."
         )
     return logs[0]
 

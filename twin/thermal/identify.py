@@ -19,7 +19,7 @@ import msgspec
 import networkx as nx
 import numpy as np
 
-from fleet.errors import ArgumentError, FleetError, IdentificationError
+from fleet.errors import ArgumentError, FleetError, IdentificationError, distinguish
 from fleet.fields import check_instance, check_value
 from fleet.heat.motor import Motors, copper_loss, gen3_motors, magnet_factor, thermal_data
 from fleet.heat.thermal import (
@@ -695,9 +695,10 @@ def check_ambient(log: Recording, ambient_c: float) -> None:
     """Raise a FleetError if a motor temperature of a log is below its ambient temperature."""
     coolest_c = np.inf if log.temp_c is None else float(log.temp_c.min(initial=np.inf))
     if coolest_c < ambient_c - BELOW_AMBIENT_K:
+        coolest, ambient = distinguish(coolest_c, ambient_c)
         raise FleetError(
-            f"The log '{log.name}' has a motor at {coolest_c:.1f} °C, below the ambient temperature of {ambient_c:g} "
-            "°C, which no powered motor can be. State the ambient temperature of the log in °C (--ambient)."
+            f"The log '{log.name}' has a motor at {coolest} °C, below the ambient temperature of {ambient} °C, which "
+            "no powered motor can be. State the ambient temperature of the log in °C (--ambient)."
         )
 
 
@@ -705,19 +706,18 @@ def _check_logs(recordings: Sequence[Recording], logs: Sequence[HeatLog], nomina
     seconds, whole_s = sum(log.time_s[-1] - log.time_s[0] for log in logs), sum(r.duration_s for r in recordings)
     names = f"'{recordings[0].name}'" if len(recordings) == 1 else f"{len(recordings)} logs ('{recordings[0].name}', …)"
     if seconds < LEAST_S:
-        length = f"{whole_s:.3g} s"
-        if whole_s >= LEAST_S:
-            length = f"{seconds:.3g} s in stretches without a gap, of {whole_s:.3g} s"
+        length, least = distinguish(seconds if whole_s >= LEAST_S else whole_s, LEAST_S)
+        length += " s" if whole_s < LEAST_S else f" s in stretches without a gap, of {whole_s:.4g} s"
         raise IdentificationError(
-            f"Too little was recorded in {names}: {length}, at least {LEAST_S:.0f} s are needed. Record half an hour "
+            f"Too little was recorded in {names}: {length}, at least {least} s are needed. Record half an hour "
             "of work and cooling."
         )
     change_k = max(float(np.ptp(log.temp_c, axis=0).max()) for log in logs)
     if change_k < LEAST_CHANGE_K:
+        change, least = distinguish(change_k, LEAST_CHANGE_K)
         raise IdentificationError(
-            f"No motor warms or cools by more than {change_k:.2f} K within a recording of {names}, {LEAST_CHANGE_K} K "
-            "are needed at least. Record the arm while it works after a rest, or hold a load outstretched for some "
-            "minutes."
+            f"No motor warms or cools by more than {change} K within a recording of {names}, {least} K are needed "
+            "at least. Record the arm while it works after a rest, or hold a load outstretched for some minutes."
         )
     motors = nominal.motors
     most_a = np.sqrt(max(log.current_sq(motors.coulomb_nm, motors.viscous_nms_per_rad).max() for log in logs))

@@ -31,7 +31,7 @@ from fleet.bus.protocol.messages import (
     PersonRequest,
     Share,
 )
-from fleet.errors import check_names
+from fleet.errors import check_names, distinguish
 from fleet.fields import MAX_SPEED, MIN_SPEED
 from fleet.job import (
     BOUNDS,
@@ -108,7 +108,8 @@ class JobSpec(msgspec.Struct, frozen=True, omit_defaults=True):
         check_dwell(self, self.kind, self.dwell_s)
         check_duration(self, self.dwell_s, self.repetitions)
         if self.due_s is not None and self.due_s < self.release_s:
-            raise ValueError(f"JobSpec.due_s must be >= release_s = {self.release_s:g} (got {self.due_s:g}).")
+            release, due = distinguish(self.release_s, self.due_s, 6)
+            raise ValueError(f"JobSpec.due_s must be >= release_s = {release} (got {due}).")
 
 
 Jobs = Annotated[tuple[JobSpec, ...], msgspec.Meta(min_length=1, max_length=MOST_JOBS)]
