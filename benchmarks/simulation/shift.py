@@ -263,10 +263,12 @@ class Shift(Fleet):
         for name in done:
             request(self, Settle(name, "done"))
         deadline_s = self.world.now_s + SETTLE_S
-        while left := [name for name, state in self.statuses().items() if name in done and state == "unfinished"]:
-            if self.world.now_s > deadline_s:
-                raise Violation(f"'{left[0]}' was settled as done, and is called unfinished.")
+        while done:
             self.world.run(self.world.now_s + CHECK_S)
+            if all(self.node(name) is not None for name in self.names):  # a person may restart one still
+                done = [name for name, state in self.statuses().items() if name in done and state == "unfinished"]
+            if done and self.world.now_s > deadline_s:
+                raise Violation(f"'{done[0]}' was settled as done, and is called unfinished.")
 
     def _wait_until_settled(self) -> None:
         deadline_s = self.world.now_s + SETTLE_S + 3.0 * self.work_s
