@@ -1,5 +1,6 @@
 """Uncritical or anomalous: a threshold on a twin's cumulative error with a bounded rate of false alarms."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,9 +51,10 @@ class Rule:
             )
         count, wanted = self.twin.calibration.smallest_group, fewest(self.alpha)
         if count < wanted:
+            least = math.ceil(1e4 / (count + 1)) / 1e4  # not rounded to a rate that is refused, too
             raise NoGuarantee(
                 f"A false-alarm rate of {self.alpha:g} needs {wanted} held-out cool jobs of each kind or more (the "
-                f"twin of '{self.twin.arm}' has {count}). Choose --alpha >= {1 / (count + 1):.3g}, or train with more: "
+                f"twin of '{self.twin.arm}' has {count}). Choose --alpha >= {least:g}, or train with more: "
                 "a larger --hold-out or more cool logs, or twin.exploration of a scenario."
             )
 

@@ -487,7 +487,9 @@ def test_a_job_that_the_first_arm_refuses_is_kept_by_no_other_arm(fleet_of):
     fleet.cut("arm_2")
     fleet.node("arm_2").work_source.participant.granter.add_jobs([job("a", release_s=1e6)])
     fleet.world.split({})
-    assert fleet.submit(job("b", after=("a",), release_s=1e6))[0].reason.startswith("It waits for 'a', which is unknown")
+    assert fleet.submit(job("b", after=("a",), release_s=1e6))[0].reason.startswith(
+        "It waits for 'a', which is unknown"
+    )
     fleet.until(lambda: fleet.is_everywhere("a", "waiting"))
     assert "b" not in {name for known in fleet.known() for name in known}
 

@@ -1,6 +1,7 @@
 """Verdicts, measures and simpler scores against closed forms and second methods."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -64,6 +65,10 @@ def test_no_verdict_without_a_guarantee(twin, make_plan, motion):
         NoGuarantee, match=r"needs 19 held-out cool jobs of each kind .* has 3\). Choose --alpha >= 0.25"
     ):
         Rule(twin=known)
+    with pytest.raises(NoGuarantee) as refused:
+        Rule(twin=twin.with_calibration(jobs * 14, jobs * 6 + jobs[:3]), alpha=0.03)
+    least = float(re.search(r"--alpha >= (\S+),", str(refused.value))[1])
+    assert 1 / 28 <= least < 0.036, "the given rate is not refused itself"
     with pytest.raises(FleetError, match="alpha must be between 0 and 1"):
         Rule(twin=known, alpha=1.0)
     with pytest.raises(FleetError, match="No reading 'lod'; did you mean 'load'"):

@@ -14,6 +14,7 @@ from fleet.engine.shift import StepRecord, initial, step
 from fleet.engine.state import DONE, State
 from fleet.engine.step import ROUNDING_S
 from fleet.engine.world import Arm, World, build_world, law_of
+from fleet.errors import distinguish
 from fleet.events import Event
 from fleet.heat.motor import current
 from fleet.heat.thermal import HOUSING, WINDING, ThermalModel
@@ -479,7 +480,8 @@ class SimulatedBody:
     def clear_fault(self) -> str:
         hottest_c = float(self._state.temp_c[0, 0, WINDING].max())
         if hottest_c >= self._limits.restart_c:
-            return f"a motor has {hottest_c:.1f} °C; a fault can be cleared below {self._limits.restart_c:g} °C"
+            is_c, limit_c = distinguish(hottest_c, self._limits.restart_c, 3)
+            return f"a motor has {is_c} °C; a fault can be cleared below {limit_c} °C"
         self._state = self._state.changed(clear_at_s=np.full((1, 1), float(self._state.tick[0]) * self._dt_s))
         return ""
 
