@@ -122,12 +122,12 @@ def list_command(
         listener.serve(time.monotonic() + LISTEN_S)
         snapshot = listener.view.snapshot(time.monotonic())
         known = {job.job: job for job in snapshot.jobs if not names or job.job in names}
-        now_s = max((arm.time_s or 0.0 for arm in snapshot.arms), default=0.0)
+        now_s = snapshot.time_s or 0.0
         try:  # results tell neither predicted ends nor why jobs wait
             query = partial(query_statuses, link, names=names or (), timeout_s=REPLY_S)
             now = link.wait(query, REPLY_S).first(keys.of_jobs(link.fleet, "status"))
             known |= {job.job: job for job in now.jobs}
-            now_s = max(now_s, now.time_s)
+            now_s = now.time_s
             if now.next:
                 wanted = len(names or ()) or sum(now.counts.values())
                 say(f"Only {len(now.jobs)} of {wanted} jobs arrived in time.", err_console)

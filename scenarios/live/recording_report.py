@@ -12,6 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from statistics import median_low
 from typing import Any  # values of a card
 
 import msgspec
@@ -41,6 +42,8 @@ MOST_SAMPLES = 20_000
 """Samples of telemetry in a report, in time."""
 ABSENT_SAMPLES = 30
 """Without a state for this many typical intervals, an arm has no temperature in the report."""
+AHEAD_S = 60.0
+"""Fleet seconds after the end of the fleet, from which on a state without an epoch is of a wrong clock."""
 TELEMETRY = "telemetry of "
 """Before the name of an arm, its states in the card."""
 RESTARTED, ABSENT = "the arm was restarted", "no later state of the arm is recorded"
@@ -80,6 +83,10 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
     epochs = epochs_of(card.senders)
     kinds: tuple[Kind, ...] = ("telemetry", "events", "results", "operations")
     table, log, results, operations = (_of_epoch(read_parts(folder, kind), epochs) for kind in kinds)
+    end_s, ahead = _end_s(table, results, operations), pc.field("epoch") == ""
+    ahead &= pc.field("time_s") > end_s + AHEAD_S
+    wrong = names_text(sorted(set(table.filter(ahead)["arm"].to_pylist())))
+    table, log = (each.filter(~ahead) for each in (table, log))
     arms = tuple(sorted(set(table["arm"].to_pylist())))
     if not arms:
         which = f" of the epoch {epochs[-1]}" if epochs else ""
@@ -126,7 +133,11 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
         halts=(*_silences(alarms, results["time_s"].to_pylist(), arms), *pauses),
         ended_s=min((row["time_s"] for row in results.to_pylist() if row["shift_ended"]), default=math.inf),
         offers=tuple(offer for row in results.to_pylist() for offer in offers_of(row)),
-        remarks=(*_left_out(epochs, card.senders), *([] if results.num_rows else [NO_STATES])),
+        remarks=(
+            *_left_out(epochs, card.senders),
+            *([f"The clock of {wrong} was ahead: what has a time after {clock(end_s)} is left out."] if wrong else []),
+            *([] if results.num_rows else [NO_STATES]),
+        ),
         unknown="" if results.num_rows else "unknown: jobs that no arm finished",
         model=model,
     )
@@ -164,6 +175,15 @@ def _left_out(epochs: Sequence[str], senders: Mapping[str, SenderCount]) -> Iter
     if others:
         names = names_text([*dict.fromkeys(epoch for other in others.values() for epoch in other)])
         yield f"{names_text([*others])} published states of another epoch, {names}: this page leaves them out."
+
+
+def _end_s(table: pa.Table, *others: pa.Table) -> float:
+    """Latest fleet time by messages that name an epoch, and by half of the arms; infinite if none does."""
+    named_s = [each.filter(pc.field("epoch") != "")["time_s"].to_numpy() for each in (table, *others)]
+    if not (ends_s := [float(times_s.max()) for times_s in named_s if len(times_s)]):
+        return math.inf
+    last_s = table.group_by("arm").aggregate([("time_s", "max")])["time_s_max"].to_pylist()
+    return max([*ends_s, *([median_low(last_s)] if last_s else [])])
 
 
 def _cell(

@@ -240,8 +240,7 @@ def heading(fleet: FleetSnapshot) -> Text:
 
 def time_line(fleet: FleetSnapshot, end_s: float | None = None) -> Text:
     """Fleet time, its speed, and what is left of the shift."""
-    now_s = max((arm.time_s for arm in fleet.arms if arm.time_s is not None and arm.present), default=None)
-    if now_s is None:
+    if (now_s := fleet.time_s) is None:
         return _line("no time yet")
     if end_s is None:
         return _line(clock(now_s))

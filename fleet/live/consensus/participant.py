@@ -299,7 +299,7 @@ class Participant:
     def _status_of(self, entry: JobEntry) -> JobStatus:
         """Return the status of a job, with the expected finish of one in work."""
         status = self.book.status_of(entry)
-        return replace(status, finish_s=finish_s(status, self.states.get(status.arm)))
+        return replace(status, finish_s=finish_s(status, self.states.get(status.arm), self._time_s))
 
     def _refusal(self, job: str) -> str:
         """Return why no arm can do a job, or none works; "" if one can, or this arm does not know whether it can."""

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from datetime import timedelta
 from functools import partial
 from itertools import repeat
+from statistics import median_low
 from typing import Literal, TypeVar
 
 import msgspec
@@ -36,6 +37,7 @@ from fleet.bus.protocol.messages import DifficultyScores, Info, State
 from fleet.bus.protocol.operator import ALL_ARMS, Alarm, ControlRequest, Operation, Pause, Resume, by_whom
 from fleet.errors import BusError
 from fleet.events import EVENT_KINDS
+from fleet.live.clock import FleetClock
 from fleet.live.job_client import query_statuses
 from fleet.live.job_rules import Position, urgency
 from fleet.live.sensors import ArmSensors
@@ -182,6 +184,8 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
     """Who paused an arm, by arm, from the last status reply; "*" for all arms."""
     left_out: dict[str, str] = {}
     """Why an arm is awarded no job for a while, by arm, from the last status reply."""
+    time_s: float | None = None
+    """Fleet time, of whoever replies about the jobs; without a reply the median of present arms. None if unknown."""
     speed: float | None = None
     """Fleet seconds per real second."""
     changes: dict[str, int] = {}
@@ -276,8 +280,8 @@ class FleetView:
     """State of a fleet, as its messages show it."""
 
     fleet: str
-    speed: float | None = None
-    """Fleet seconds per real second; None while unknown."""
+    clock: FleetClock | None = None
+    """Fleet time and its speed; None while nobody has replied."""
     began_s: float | None = None
     """Real second at which a listener began."""
     heard_s: float = math.inf
@@ -382,10 +386,11 @@ class FleetView:
         statuses = [job.status for job in self._jobs.values()]
         ended = {status.job for status in statuses if status.state in ("finished", "unfinished")}
         waiting = {status.job: status.reason for status in statuses if status.state == "waiting"}
-        arms = (_arm_snapshot(name, self._arms[name], now_s, self.speed, ended) for name in sorted(self._arms))
+        speed = None if self.clock is None else self.clock.speed
+        arms = tuple(_arm_snapshot(name, self._arms[name], now_s, speed, ended) for name in sorted(self._arms))
         now = FleetSnapshot(
             fleet=self.fleet,
-            arms=tuple(arms),
+            arms=arms,
             auctioneers=tuple(
                 AuctioneerSnapshot(name, each.token, _age_s(each.heard_s, now_s), each.trouble)
                 for name, each in sorted(self._auctioneers.items())
@@ -396,7 +401,8 @@ class FleetView:
             space=self._space,
             paused=dict(self._paused),
             left_out=dict(self._left_out),
-            speed=self.speed,
+            time_s=_median_s(arms) if self.clock is None else self.clock.now_s(now_s),
+            speed=speed,
             alarms=tuple(self.alarms.values()),
             listened_s=_age_s(self.began_s, now_s) or 0.0,
             lost_s=_age_s(self.lost_s, now_s),
@@ -474,7 +480,8 @@ class FleetListener:
             self._status_due_s = asked_s + STATUS_EVERY_S
             fleet, done = self._link.fleet, partial(self._statuses, asked_s)
             try:
-                self._link.query(keys.of_clock(fleet), ClockRequest(), Clock, self._clocks, timeout_s=STATUS_EVERY_S)
+                clocks = partial(self._clocks, asked_s)
+                self._link.query(keys.of_clock(fleet), ClockRequest(), Clock, clocks, timeout_s=STATUS_EVERY_S)
                 query_statuses(self._link, done, timeout_s=STATUS_EVERY_S, most=MAX_JOBS)
             except BusError as error:
                 _LOG.warning("%s", error)
@@ -492,9 +499,9 @@ class FleetListener:
         if self.view.set_token(role, name, present):
             self._on_presence(role, name, present)
 
-    def _clocks(self, answers: Replies[Clock]) -> None:
+    def _clocks(self, asked_s: float, answers: Replies[Clock]) -> None:
         for reply in answers.messages.values():
-            self.view.speed = reply.speed
+            self.view.clock = FleetClock(reply.speed).set_to(asked_s, asked_s + answers.took_s, reply.time_s)
 
     def _statuses(self, asked_s: float, answers: Replies[Status]) -> None:
         replies = list(answers.messages.values())
@@ -579,6 +586,13 @@ def why_idle(arm: ArmSnapshot, waiting: Mapping[str, str], fleet: FleetSnapshot,
 def bids_of(arm: ArmSnapshot, waiting: Container[str]) -> int:
     """Number of the waiting jobs that an arm has said it can do."""
     return sum(job in waiting and score != JobScore() for job, score in arm.scores.items())
+
+
+def _median_s(arms: Sequence[ArmSnapshot]) -> float | None:
+    """Median of the times of the present arms, or of all without one: an arm may have a wrong clock."""
+    times_s = [(arm.present, arm.time_s) for arm in arms if arm.time_s is not None]
+    some = any(present for present, _ in times_s)
+    return median_low(time_s for present, time_s in times_s if present or not some) if times_s else None
 
 
 def _age_s(at_s: float | None, now_s: float) -> float | None:

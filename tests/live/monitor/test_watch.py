@@ -30,7 +30,7 @@ def shown(now, width=80, height=24, events=(), **more):
 
 
 def fleet_of(arms):
-    return FleetSnapshot("f", tuple(arms), (), {"waiting": 2, "finished": 1}, ())
+    return FleetSnapshot("f", tuple(arms), (), {"waiting": 2, "finished": 1}, (), time_s=3661.0)
 
 
 SCORES = {"x": JobScore(52.0, 0.02), "y": JobScore(), "z": JobScore(41.0, 0.25, 0.5)}
