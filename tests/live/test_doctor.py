@@ -230,6 +230,8 @@ def test_an_arm_whose_states_are_malformed_is_not_said_to_hang(age_s, says):
     ("change", "why"),
     [
         ({"token": False, "state_age_s": 0.5}, "it publishes its state but shows no token"),
+        ({"token": False, "state_age_s": 0.5, "leaving": True, "away": True}, "it was stopped away from home."),
+        ({"token": False, "state_age_s": 9.5, "leaving": True, "job": "j"}, "it was stopped with a job."),
         ({"token": False, "state_age_s": 3.5}, "it has left, or its process hangs or has ended."),
         ({"state_age_s": 5.0, "state_gap_s": 10.0}, "its last two states came 10.0 s apart"),
         ({"state_age_s": 5.0, "state_gap_s": 0.1}, "it has left, or its process hangs or has ended."),

@@ -253,6 +253,7 @@ class AsyncBridge:
         now = self._listener.view.snapshot(real_s)
         if lost := check_connection(now):
             self._earlier.clear()
+            self._known = [each for each in self._known if self._alarms.lasts(each)]  # no other one begins meanwhile
         else:
             earlier = self._earlier[0] if len(self._earlier) == self._earlier.maxlen else None
             complaints = self._link.complaints(real_s - FRESH_S)

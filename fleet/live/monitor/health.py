@@ -233,9 +233,14 @@ def _paused(arms: Sequence[str]) -> str:
 
 
 def check_connection(fleet: FleetSnapshot) -> list[Finding]:
-    """Check that the listener has a connection to the router: without one a snapshot shows an earlier fleet."""
+    """Check that the listener has a connection to the router: without one a snapshot shows an earlier fleet.
+
+    It is as it should be that a router ends after all arms.
+    """
     if fleet.lost_s is None:
         return []
+    if fleet.arms and all(arm.leaving for arm in fleet.arms):
+        return [Finding("note", "All arms have left, and the router has ended.")]
     why = (
         fleet.expiry.rstrip(".")
         or "The connection to the router is lost: the router has ended, hangs, or is unreachable"
@@ -394,14 +399,16 @@ def check_arm(arm: ArmSnapshot, offset_s: float | None, *, malformed: str = "") 
         cause, why = "its states are malformed.", f"its states are malformed: {malformed}"
     elif arm.token and arm.state_gap_s is not None and arm.state_gap_s > FRESH_S:
         why = cause = f"its last two states came {arm.state_gap_s:.1f} s apart, and at least two a second are needed."
-    if not arm.token:
+    if arm.leaving and not arm.token:
+        problem = f"was stopped {'away from home' if arm.away else 'with a job'}."
+        why = f"it {problem}"
+    elif not arm.token:
         problem = "publishes its state but shows no token: it left, or another process uses its name."
+        why = f"it {problem}" if age_s is not None and age_s <= FRESH_S else why
     elif age_s is None:
         problem = f"shows its token but publishes no {'valid ' if malformed else ''}state: {cause}"
     elif age_s > FRESH_S:
         problem = f"is stale, with a last state {age_s:.1f} s old: {cause}"
-    if not arm.token and age_s is not None and age_s <= FRESH_S:
-        why = f"it {problem}"
     absent = f"{arm.arm} is absent: {why}"
     findings = [Finding("fault", f"{arm.arm} {problem}", "absent", arm.arm, lasting=absent)] if problem else []
     if arm.doubled:

@@ -126,6 +126,8 @@ class ArmSnapshot(msgspec.Struct, frozen=True):
     """Fleet seconds until it is home with its current job done."""
     away: bool = False
     """It reports that it is away from home."""
+    leaving: bool = False
+    """Its last state says that its process ends in order."""
     left: bool = False
     """It has ended in order: it shows no token, and its last state says so, without job and space."""
     doubled: bool = False
@@ -652,6 +654,7 @@ def _arm_snapshot(name: str, arm: _Arm, now_s: float, speed: float | None, ended
         job=state.job if state else "",
         busy_s=state.busy_s if state else 0.0,
         away=bool(state and state.space),
+        leaving=bool(state and state.leaving),
         left=bool(not arm.token and state and state.leaving and not state.job and not state.space),
         doubled=arm.is_doubled(now_s),
         scores={job: score for job, score in by_job if job not in ended},
