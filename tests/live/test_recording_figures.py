@@ -56,19 +56,22 @@ def test_an_arm_whose_clock_is_ahead_does_not_stretch_the_report(tmp_path, away)
 
 
 def test_a_late_job_of_an_arm_without_events_is_late_everywhere_and_drawn_as_its_work(tmp_path):
-    """Accepted at 10 s, due at 5 s, awarded at 20 s and finished at 80 s: 75 s late, and 60 s of work."""
+    """Accepted at 10 s, due at 5 s, awarded at 20 s and finished at 80 s: 75 s late, and 60 s of work.
+
+    The award of another one, 30 s late, is not recorded.
+    """
     times = {"accepted_s": 10.0, "due_s": 5.0}
     changes = [
         result(1, 20.0, to="awarded", cycles=0, **times),
         result(2, 80.0, finished_s=80.0, **times),
-        result(3, 90.0, job="k", finished_s=90.0),
+        result(3, 90.0, job="k", finished_s=90.0, due_s=60.0),
     ]
     log = shown(tmp_path, *(state("a", tick) for tick in range(1, 101)), *changes)
     outcome, metrics = verdict(log), log.card["metrics"]
-    assert [(each.job, each.late_s) for each in late_jobs(log)] == [("j", 75.0)]
-    assert (outcome.badge, outcome.good) == ("1 late job", False)
-    assert "2 of 2 jobs finished, 1 of them on time." in outcome.sentences
-    assert (metrics["on_time"], metrics["tardiness_min"]) == (1, 75.0 / 60.0)
+    assert [(each.job, each.late_s) for each in late_jobs(log)] == [("j", 75.0), ("k", 30.0)]
+    assert (outcome.badge, outcome.good) == ("2 late jobs", False)
+    assert "2 of 2 jobs finished, 0 of them on time." in outcome.sentences
+    assert (metrics["on_time"], metrics["tardiness_min"]) == (0, 105.0 / 60.0)
     assert [(a.arm, a.job, a.start_s, a.end_s, a.late_s) for a in log.plan.assignments] == [
         ("a", "j", 20.0, 80.0, 75.0)
     ]
@@ -127,6 +130,7 @@ def test_an_arm_that_was_not_there_is_grey_in_the_heat_map(tmp_path):
     cells = np.frombuffer(base64.b64decode(heat["z"]["bdata"]), np.uint8).reshape(rows, columns)
     assert (cells[:-1] == 1 + 2 * (30 - 20)).all()
     assert 20 < (cells[-1] == 0).sum() < 40
+    assert {*log.readings.mode[:20, -1]} == {-1}
     assert heat["colorscale"][0] == [0.0, UNKNOWN]
     assert heat["colorscale"][1][0] * heat["zmax"] == 0.5
     assert "grey: no reading" in heat["colorbar"]["title"]["text"]
