@@ -235,12 +235,15 @@ def _without_conflicts(bidding: Bidding, pairs: Iterable[tuple[str, Assignment]]
     return kept
 
 
-def no_arm_can(reasons: Mapping[str, str], *, all_known: bool = True) -> str:
+def no_arm_can(reasons: Mapping[str, str], *, all_known: bool = True, absent: Set[str] = frozenset()) -> str:
     """Return the reason of a job that no arm can do, from the reasons of the arms.
 
     Args:
         all_known: Whether all present arms have answered.
+        absent: Arms that are not present, of which it is unknown whether they can.
     """
+    if absent:
+        return _no_arm(reasons, [_not_present(absent)], "arm")
     start = f"No arm {'' if all_known else 'that has answered '}can do it: "
     each = start + "; ".join(f"{arm}: {reason}" for arm, reason in sorted(reasons.items())) + "."
     if len(each) <= MAX_REASON:
