@@ -229,12 +229,13 @@ def _line(*parts: str | tuple[str, str]) -> Text:
 
 
 def heading(fleet: FleetSnapshot) -> Text:
-    """Fleet, number of arms present, auctioneer; or since when there is no connection."""
+    """Fleet, numbers of arms present and of those that left in order, auctioneer; or since when there is no connection."""
     if fleet.lost_s is not None:
         return _line((fleet.fleet, "bold"), (f"   no connection to the router for {fleet.lost_s:.0f} s", "red"))
     present = sum(arm.present for arm in fleet.arms)
     auctioneers = ", ".join(each.auctioneer for each in fleet.auctioneers if each.token)
-    arms = (f"   {present} of {len(fleet.arms)} arms present", "" if present == len(fleet.arms) else "yellow")
+    left = f", {len(fleet.left)} left" if fleet.left else ""
+    arms = (f"   {present} of {len(fleet.arms)} arms present{left}", "" if present == len(fleet.arms) else "yellow")
     return _line((fleet.fleet, "bold"), arms, f"   auctioneer {auctioneers}" if auctioneers else "   no auctioneer")
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from fleet.bus.client import BusClient, under
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import Clock, ClockRequest, JobStatus
+from fleet.bus.protocol.auction import Clock, ClockRequest, JobStatus, Status
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Alarm
 from fleet.bus.router import Router
@@ -258,8 +258,30 @@ def test_an_arm_that_has_left_in_order_is_no_fault(change, left):
     view.update("a", msgspec.structs.replace(last, **change), 100.0)
     assert not view.snapshot(100.0).arms[0].left  # its process runs
     view.set_token("arm", "a", False)
-    (finding,) = check_arm(view.snapshot(110.0).arms[0], None)
+    (finding,) = check_arm(view.snapshot(101.0).arms[0], None)
     assert (finding.level, finding.kind) == (("note", "") if left else ("fault", "absent"))
+
+
+def test_an_arm_that_left_in_order_is_listed_no_longer_unless_somebody_waits_for_it():
+    """A second after it left it is listed, a minute later only with a job that it had or with space that is closed."""
+    view = FleetView("f")
+    view.update("a", State("a", 0, 0.0, "idle", (), 9.0, leaving=True), 100.0)
+    view.update("b", State("b", 0, 0.0, "idle", (), 9.0), 100.0)
+    view.update_jobs(Status("au", 0.0, (JobStatus("j", "finished", "a"),)), 100.0)
+    at = view.snapshot(101.0)
+    assert ([each.arm for each in at.arms], at.left) == (["a", "b"], ())
+    at = view.snapshot(160.0)
+    assert ([each.arm for each in at.arms], at.left) == (["b"], ("a",))
+    _, found = faults(at)
+    assert "Left in order: a." in [each.what for each in found.findings]
+    alarm = Alarm("m", 1, 5.0, "absent a", "absent", "a is absent.", "a")
+    assert not any("An alarm of" in each for each in faults(msgspec.structs.replace(at, alarms=(alarm,)))[0])
+    needed = Status("au", 1.0, (JobStatus("j", "unfinished", "a"),)), Status("au", 2.0, (), space={"a": ("*",)})
+    for reply in needed:
+        view.update_jobs(reply, 160.0)
+        assert view.snapshot(160.0).left == ()
+        view.update_jobs(Status("au", reply.time_s, (JobStatus("j", "finished", "a"),)), 160.0)
+        assert view.snapshot(160.0).left == ("a",)
 
 
 @pytest.mark.parametrize(

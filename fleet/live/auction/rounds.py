@@ -73,7 +73,7 @@ class Bidding:
     """Names of the spaces that each arm may take."""
     excludes: Excludes = no_conflicts
     absent: frozenset[str] = frozenset()
-    """Arms that may take space and are not present."""
+    """Arms that may take space, or belong to the cell, and are not present."""
     unasked: Mapping[str, str] = field(default_factory=dict[str, str])
     """Why other present arms have not quoted, by arm."""
     excluded: Mapping[str, Mapping[str, str]] = field(default_factory=dict[str, Mapping[str, str]])
@@ -764,7 +764,7 @@ class Rounds:
             busy=self._book.busy_stations(),
             taken=taken,
             excludes=self._excludes,
-            absent=frozenset(taken.keys() - self.present),
+            absent=frozenset(arm for arm in taken if taken[arm] or arm in self._book.arms) - self.present,
             unasked={arm: self._why_unasked(arm, closing, real_s) for arm in self.present - quotes.keys()},
             excluded=excluded,
             unfit={arm: why for arm in quotes if (why := self.sensors[arm].why_unfit)},

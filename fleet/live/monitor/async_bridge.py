@@ -260,7 +260,7 @@ class AsyncBridge:
             self._known = check_fleet(now, earlier, malformed=complaints_of_states(now, complaints))
             self._earlier.append(now)
         findings = [*self._known, *lost]
-        heard = {each.arm for each in now.arms} | {each.job for each in now.jobs}
+        heard = {each.arm for each in now.arms} | {*now.left} | {each.job for each in now.jobs}
         heard |= {each.auctioneer for each in now.auctioneers if each.heard_age_s is not None}
         findings += self._more_findings()
         for alarm in self._alarms.update(findings, now.time_s or 0.0, real_s, heard, now.speed or 1.0):

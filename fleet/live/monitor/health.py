@@ -15,6 +15,7 @@ from fleet.bus.client import under
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.operator import ALL_ARMS, by_whom
 from fleet.bus.security.tls import UNKNOWN_CERTIFICATE
+from fleet.errors import listed
 from fleet.live.clock import FleetClock
 from fleet.live.job_rules import NO_CYCLE
 from fleet.live.monitor.snapshot import FRESH_S, SILENT_S, ArmSnapshot, FleetSnapshot
@@ -154,16 +155,18 @@ def check_health(
     shown = {arm.arm for arm in fleet.arms if arm.token}
     if missing := [name for name in expected if name not in shown]:
         findings.append(Finding("fault", f"Not present: {', '.join(missing)}."))
-    listed = {arm.arm for arm in fleet.arms} | {*expected}
+    accounted = {arm.arm for arm in fleet.arms} | {*expected, *fleet.left}
     findings += [
         Finding("fault", f"An alarm of '{alarm.monitor}' that nobody has acknowledged: {alarm.what}")
         for alarm in fleet.alarms
-        if alarm.kind == "absent" and alarm.ended_s is None and not alarm.by and alarm.subject not in listed
+        if alarm.kind == "absent" and alarm.ended_s is None and not alarm.by and alarm.subject not in accounted
     ]
     if not any(arm.present for arm in fleet.arms):
         unheard = secure and not any(arm.token for arm in fleet.arms)
         hint = UNKNOWN_CERTIFICATE if unheard else ""
         findings.append(Finding("fault", f"No arm is present: none shows both a token and a fresh state.{hint}"))
+    if fleet.left:
+        findings.append(Finding("note", f"Left in order: {listed(fleet.left)}."))
     if trips_s and median(trips_s) > SLOW_S:
         findings.append(Finding("warning", f"The router is slow: a round trip takes {1000 * median(trips_s):.0f} ms."))
     if malformed:
@@ -239,7 +242,7 @@ def check_connection(fleet: FleetSnapshot) -> list[Finding]:
     """
     if fleet.lost_s is None:
         return []
-    if fleet.arms and all(arm.leaving for arm in fleet.arms):
+    if (fleet.arms or fleet.left) and all(arm.leaving for arm in fleet.arms):
         return [Finding("note", "All arms have left, and the router has ended.")]
     why = (
         fleet.expiry.rstrip(".")

@@ -174,6 +174,7 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
 
     fleet: str
     arms: tuple[ArmSnapshot, ...]
+    """Without those that left in order `FRESH_S` ago or earlier and neither have a job nor close space."""
     auctioneers: tuple[AuctioneerSnapshot, ...]
     counts: dict[str, int]
     """Number of all jobs by state."""
@@ -182,6 +183,8 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
     that have ended are dropped first."""
     space: dict[str, tuple[str, ...]] = {}
     """Names of the spaces that are closed to other arms, by arm, from the last status reply."""
+    left: tuple[str, ...] = ()
+    """Names of the arms that are left out of `arms`."""
     paused: dict[str, str] = {}
     """Who paused an arm, by arm, from the last status reply; "*" for all arms."""
     left_out: dict[str, str] = {}
@@ -389,7 +392,10 @@ class FleetView:
         ended = {status.job for status in statuses if status.state in ("finished", "unfinished")}
         waiting = {status.job: status.reason for status in statuses if status.state == "waiting"}
         speed = None if self.clock is None else self.clock.speed
-        arms = tuple(_arm_snapshot(name, self._arms[name], now_s, speed, ended) for name in sorted(self._arms))
+        every = [_arm_snapshot(name, self._arms[name], now_s, speed, ended) for name in sorted(self._arms)]
+        needed = {status.arm for status in statuses if status.state not in ("waiting", *ENDED)} | self._space.keys()
+        left = {arm.arm for arm in every if arm.left and (arm.state_age_s or 0.0) > FRESH_S} - needed
+        arms = tuple(arm for arm in every if arm.arm not in left)
         now = FleetSnapshot(
             fleet=self.fleet,
             arms=arms,
@@ -401,6 +407,7 @@ class FleetView:
             changes=dict(self._changes),
             jobs=_most_urgent(statuses, jobs),
             space=self._space,
+            left=tuple(sorted(left)),
             paused=dict(self._paused),
             left_out=dict(self._left_out),
             time_s=_median_s(arms) if self.clock is None else self.clock.now_s(now_s),

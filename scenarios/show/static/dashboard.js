@@ -10,7 +10,7 @@ const STATES = {
 
 function startPage() {
   const gateway = makeGateway();
-  const fleet = { role: "monitor", cell: null, name: "", paused: {}, speed: null, timeS: null, timeAtMs: 0, arms: new Map(), jobs: new Map(), auctioneers: [], counts: {}, refresh: poll, now: fleetTime };
+  const fleet = { role: "monitor", cell: null, name: "", paused: {}, speed: null, timeS: null, timeAtMs: 0, left: 0, arms: new Map(), jobs: new Map(), auctioneers: [], counts: {}, refresh: poll, now: fleetTime };
   const actions = makeActions(gateway, fleet);
   const offers = new Map(), awards = [], noted = new Set();
   const counted = { updates: 0, states: 0 };
@@ -206,6 +206,12 @@ function startPage() {
       if (one.state_age_s !== null) arm.atMs = Math.max(arm.atMs, nowMs - 1000 * one.state_age_s);
       arm.difficultyMs = one.difficulty_age_s === null ? null : nowMs - 1000 * one.difficulty_age_s;
     }
+    for (const name of snapshot.left) {
+      fleet.arms.delete(name);
+      if (view && index.has(name)) view.setMode(index.get(name), -1);
+      present.delete(name);
+    }
+    fleet.left = snapshot.left.length;
     for (const status of snapshot.jobs) setJob(status);
     fleet.jobs = new Map(snapshot.jobs.map((status) => [status.job, status])); // of those that have ended, the newest first
     for (const { alarm, what, by, time_s: timeS, began_s: beganS, ended_s: endedS } of snapshot.alarms) {
@@ -360,7 +366,7 @@ function startPage() {
     const all = [...fleet.arms.values()].sort(byName), here = all.filter(isPresent).length;
     const speed = fleet.speed && fleet.speed !== 1 ? `, ${Number(fleet.speed.toPrecision(3))} times as fast as real time` : "";
     const auctioneers = fleet.auctioneers.filter((each) => each.token).map((each) => each.auctioneer).join(", ");
-    setText(element("summary"), `Fleet time ${clock(fleetTime())}${speed}. ${here} of ${all.length} arms present. ${auctioneers ? `Auctioneer: ${auctioneers}` : "No auctioneer"}. Your role: ${fleet.role}.`);
+    setText(element("summary"), `Fleet time ${clock(fleetTime())}${speed}. ${here} of ${all.length} arms present${fleet.left ? `, ${fleet.left} left` : ""}. ${auctioneers ? `Auctioneer: ${auctioneers}` : "No auctioneer"}. Your role: ${fleet.role}.`);
     arms.update(all.map((arm) => [arm.name, arm]), fillArm);
     const listed = [...fleet.jobs.values()], rank = { unfinished: 0, finishing: 1, awarded: 2, waiting: 3 };
     const open = listed.filter(({ state }) => state in rank).sort((a, b) => rank[a.state] - rank[b.state]);

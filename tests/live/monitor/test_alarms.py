@@ -312,6 +312,10 @@ def test_a_listener_says_who_does_not_reply_and_why_nobody_awards_jobs():
     for arm in "ab":
         view.update(arm, state(arm, leaving=True), 18.0)
     assert [(each.level, each.kind) for each in check_connection(view.snapshot(20.0))] == [("note", "")]
+    view.set_token("arm", "a", False)
+    view.set_token("arm", "b", False)
+    late = view.snapshot(60.0)
+    assert (late.arms, [each.level for each in check_connection(late)]) == ((), ["note"])
     view.update("a", state("a", tick=2), 18.0)
     view.expiry = "The certificate of 'm' expired."
     assert check_connection(view.snapshot(20.0))[0].what.startswith("The certificate of 'm' expired. What is shown is")
