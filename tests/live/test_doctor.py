@@ -18,7 +18,15 @@ from fleet.bus.protocol.auction import Clock, ClockRequest, JobStatus, Status
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Alarm
 from fleet.bus.router import Router
-from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_arm, check_fleet, check_health, check_progress
+from fleet.live.monitor.health import (
+    OFFSET_S,
+    ClockProbe,
+    check_arm,
+    check_fleet,
+    check_health,
+    check_left_out,
+    check_progress,
+)
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, AuctioneerSnapshot, FleetSnapshot, FleetView
 from scenarios.live.doctor import show
 from scenarios.show.watch import space_line
@@ -306,6 +314,7 @@ def test_an_arm_that_answers_no_awards_is_named():
     _, found = faults(fleet(arm(), arm(arm="b"), left_out=left_out))
     (finding,) = found.findings
     assert finding.what.startswith("b has not answered the last 3 awards: it is awarded no job for a while.")
+    assert "hang" not in check_left_out("b", "gave no valid quote: 'peak_c' is NaN").what
 
 
 def test_an_arm_that_left_earlier_is_missing_only_if_expected():

@@ -219,7 +219,8 @@ def check_fleet(
 
 def check_left_out(arm: str, why: str) -> Finding:
     """Return the finding of an arm that is awarded no jobs for a while."""
-    return Finding("warning", f"{arm} {why}: it is awarded no job for a while. Its process may hang.")
+    hangs = " Its process may hang." if why.startswith("has not ") else ""
+    return Finding("warning", f"{arm} {why}: it is awarded no job for a while.{hangs}")
 
 
 def check_pauses(fleet: FleetSnapshot) -> list[Finding]:
