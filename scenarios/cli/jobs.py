@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 import typer
 
-from fleet.errors import FleetError, Refused, nearest
+from fleet.errors import FleetError, Refused, listed, nearest
 from fleet.fields import argument, option
 from fleet.job import BOUNDS, DWELL_S
 from scenarios.cli import options
@@ -137,7 +137,8 @@ def list_command(
                 raise FleetError(f"Nobody tells of jobs: {error}{hint}") from error
             say(f"These are the last known changes: {error}", err_console)
     jobs = sorted(known.values(), key=lambda status: status.job)
-    if unknown := sorted({*(names or ())} - {job.job for job in jobs}):
+    unknown = sorted({*(names or ())} - {job.job for job in jobs})
+    if unknown and not jobs:
         near = nearest(unknown[0], [job.job for job in snapshot.jobs])
         raise FleetError(f"The fleet knows no job '{unknown[0]}'{near}")
 
@@ -158,6 +159,8 @@ def list_command(
         print_json(jobs)
     else:
         print_lines(table, ("cycles", "end", "age", "due"))
+    if unknown:
+        raise FleetError(f"The fleet knows no job {listed(map(repr, unknown))}.")
 
 
 def cancel_command(

@@ -229,7 +229,7 @@ def _line(*parts: str | tuple[str, str]) -> Text:
 
 
 def heading(fleet: FleetSnapshot) -> Text:
-    """Fleet, numbers of arms present and of those that left in order, auctioneer; or since when there is no connection."""
+    """Fleet, numbers of arms present and left, auctioneer; or since when there is no connection."""
     if fleet.lost_s is not None:
         return _line((fleet.fleet, "bold"), (f"   no connection to the router for {fleet.lost_s:.0f} s", "red"))
     present = sum(arm.present for arm in fleet.arms)

@@ -28,7 +28,7 @@ from fleet.live.monitor.health import (
     check_progress,
 )
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, AuctioneerSnapshot, FleetSnapshot, FleetView
-from scenarios.live.doctor import show
+from scenarios.live.doctor import reach_of, show
 from scenarios.show.watch import space_line
 from tests import commands
 from tests.waiting import serving
@@ -358,6 +358,24 @@ def test_text_of_others_forges_no_line_of_the_report(capsys):
     paused = fleet(arm(), paused={"a": "ann'.\nfault: 'b"})
     show("tcp/127.0.0.1:1", paused, check_health(paused, 106.5, [ASKED]))
     assert "note: a is paused by 'ann'.\\nfault: 'b'." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "variables", "options"),
+    [
+        ("tcp/127.0.0.1:7447", {}, ""),
+        ("tcp/127.0.0.1:7661", {}, " --endpoint tcp/127.0.0.1:7661 --fleet 'line 7'"),
+        ("tcp/127.0.0.1:7661", {"THERMOFLEET_ENDPOINT": "tcp/127.0.0.1:7661", "THERMOFLEET_FLEET": "line 7"}, ""),
+    ],
+)
+def test_a_command_that_the_report_names_reaches_the_fleet(monkeypatch, endpoint, variables, options):
+    for name in ("THERMOFLEET_ENDPOINT", "THERMOFLEET_FLEET"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    reach = reach_of(endpoint, "line 7" if options or variables else "")
+    (line,) = faults(fleet(arm(), space={"b": ("*",)}, jobs=()), reach=reach)[1].findings
+    assert line.what.endswith(f"thermofleet arm clear b{options}")
 
 
 def test_a_warning_is_no_fault():

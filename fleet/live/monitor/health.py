@@ -121,6 +121,7 @@ def check_health(
     expected: Sequence[str] = (),
     other_versions: Sequence[str] = (),
     earlier: FleetSnapshot | None = None,
+    reach: str = "",
 ) -> HealthReport:
     """Check a fleet that was listened to for a while.
 
@@ -133,6 +134,7 @@ def check_health(
         expected: Arms that should be present: one that left earlier leaves no trace.
         other_versions: A sentence on each participant that uses another version of the bus.
         earlier: Snapshot of a second before or more; None: whether jobs wait in vain is not checked.
+        reach: Options with which a command reaches this fleet.
     """
     trips_s = [probe.answered_s - probe.asked_s for probe in probes]
     clock = best_clock(probes)
@@ -145,6 +147,7 @@ def check_health(
             earlier,
             {a: off_s for a, off_s in offsets_s.items() if abs(off_s - common_s) > OFFSET_S},
             complaints_of_states(fleet, complaints),
+            reach,
         ),
     ]
     if abs(common_s) > OFFSET_S:
@@ -192,6 +195,7 @@ def check_fleet(
     earlier: FleetSnapshot | None,
     offsets_s: Mapping[str, float] = NO_OFFSETS,
     malformed: Mapping[str, str] = NO_COMPLAINTS,
+    reach: str = "",
 ) -> list[Finding]:
     """What snapshots show of arms, jobs and space: the findings that raise alarms, except that of a lost connection.
 
@@ -199,6 +203,7 @@ def check_fleet(
         earlier: As in `check_health`.
         offsets_s: As in a report, of the arms whose offset is to be checked.
         malformed: Why the last state of an arm was dropped as malformed, as far as it is known.
+        reach: As in `check_health`.
     """
     arms = (
         finding
@@ -213,7 +218,7 @@ def check_fleet(
         *check_awards(fleet),
         *check_jobs(fleet),
         *check_progress(fleet, earlier),
-        *check_space(fleet),
+        *check_space(fleet, reach),
     ]
 
 
@@ -330,7 +335,7 @@ def _is_at_work(fleet: FleetSnapshot) -> bool:
     return awarded > 0 or any(arm.present and arm.mode == "working" for arm in fleet.arms)
 
 
-def check_space(fleet: FleetSnapshot) -> list[Finding]:
+def check_space(fleet: FleetSnapshot, reach: str = "") -> list[Finding]:
     """Check that no arm that is not present keeps space closed; a fault if jobs wait for it."""
     present = {arm.arm for arm in fleet.arms if arm.present}
     silent_s = {arm.arm: arm.state_age_s for arm in fleet.arms if arm.state_age_s is not None}
@@ -343,7 +348,7 @@ def check_space(fleet: FleetSnapshot) -> list[Finding]:
                 "fault" if waits else "warning",
                 f"The space of {arm} stays closed to other arms, as {arm} is not present{since}"
                 f"{f'; {waits} job(s) wait for it' if waits else ''}. If you have seen that it is at home or removed, "
-                f"and is switched off: thermofleet arm clear {quote(arm)}",
+                f"and is switched off: thermofleet arm clear {' '.join(filter(None, (quote(arm), reach)))}",
                 "space",
                 arm,
                 lasting=f"The space of {arm} stays closed to other arms, as it is not present. Clear it once a person "
