@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import ArmEvent, JobState, JobStatus, Status, StatusRequest
+from fleet.bus.protocol.auction import ArmEvent, Clock, ClockRequest, JobState, JobStatus, Status, StatusRequest
 from fleet.bus.protocol.messages import DifficultyScores
 from fleet.bus.router import Router
 from fleet.live.clock import FleetClock
@@ -20,7 +20,7 @@ from fleet.live.monitor.health import check_jobs
 from fleet.live.monitor.snapshot import FRESH_S, FleetListener, FleetView, JobScore
 from tests.live.many_jobs import ManyJobs, entries
 from tests.live.monitor.messages import result, stands, state
-from tests.waiting import serve_until, serving, wait_until
+from tests.waiting import PATIENCE_S, serve_until, serving, wait_until
 
 
 @given(token=st.booleans(), age_s=st.floats(0.0, 10.0), spoke=st.booleans())
@@ -281,6 +281,17 @@ def test_a_listener_counts_only_the_jobs_of_the_present_fleet(monkeypatch):
         for fleet in ({"finished": 2}, {"waiting": 1}):
             serve_until(lambda fleet=fleet: seen.view.snapshot(0.0).counts == fleet, seen, auctioneer)
             del fleets[:-1]
+
+
+def test_a_listener_asks_for_the_time_of_the_fleet():
+    """The reply is read within the seconds that the test may take."""
+    with Router() as router, BusClient(router.endpoint, "f") as link, BusClient(router.endpoint, "f") as auctioneer:
+        auctioneer.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(5000.0, 2.0))
+        seen = FleetListener(link)
+        serve_until(lambda: seen.view.clock is not None, seen, auctioneer)
+        now = seen.view.snapshot(time.monotonic())
+        assert now.speed == 2.0
+        assert 5000.0 <= (now.time_s or 0.0) < 5000.0 + 2.0 * PATIENCE_S
 
 
 def test_a_listener_finds_an_unfinished_job_among_300_finished_ones_without_results(monkeypatch):
