@@ -203,7 +203,10 @@ def test_a_visitor_with_a_wrong_clock_changes_no_time_and_has_no_row_once_it_lef
         publish = visitor.publisher(keys.of_arm("f", "visitor", "state"), State)
         publish(State("visitor", 1, 1.8e6, "idle", (30.0,) * 7, 30.0))
         expect(rows).to_have_count(3)
-        expect(summary).not_to_contain_text("500:")
+        for _ in range(2):  # what the first one brought is drawn
+            with page.expect_response("**/v4/fleet*"):
+                pass
+        expect(summary).not_to_contain_text("500:00")
         publish(State("visitor", 2, 1.8e6, "idle", (30.0,) * 7, 30.0, leaving=True))
         wait_until(lambda: served.ask("GET", "/v4/fleet")[2]["arms"][2]["leaving"])
     expect(rows).to_have_count(2)
