@@ -241,7 +241,8 @@ def heading(fleet: FleetSnapshot) -> Text:
 
 def time_line(fleet: FleetSnapshot, end_s: float | None = None) -> Text:
     """Fleet time, its speed, and what is left of the shift."""
-    if (now_s := fleet.time_s) is None:
+    there = any(each.token for each in (*fleet.arms, *fleet.auctioneers))
+    if (now_s := fleet.time_s) is None or not there:
         return _line("no time yet")
     if end_s is None:
         return _line(clock(now_s))

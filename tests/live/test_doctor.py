@@ -285,6 +285,8 @@ def test_an_arm_that_left_in_order_is_listed_no_longer_unless_somebody_waits_for
     alarm = Alarm("m", 1, 5.0, "absent a", "absent", "a is absent.", "a")
     assert not any("An alarm of" in each for each in faults(msgspec.structs.replace(at, alarms=(alarm,)))[0])
     needed = Status("au", 1.0, (JobStatus("j", "unfinished", "a"),)), Status("au", 2.0, (), space={"a": ("*",)})
+    view.update_jobs(Status("au", 0.5, (JobStatus("j", "unfinished", "a", shift_ended=True),)), 160.0)
+    assert view.snapshot(160.0).left == ("a",)
     for reply in needed:
         view.update_jobs(reply, 160.0)
         assert view.snapshot(160.0).left == ()

@@ -393,7 +393,8 @@ class FleetView:
         waiting = {status.job: status.reason for status in statuses if status.state == "waiting"}
         speed = None if self.clock is None else self.clock.speed
         every = [_arm_snapshot(name, self._arms[name], now_s, speed, ended) for name in sorted(self._arms)]
-        needed = {status.arm for status in statuses if status.state not in ("waiting", *ENDED)} | self._space.keys()
+        needed = {each.arm for each in statuses if each.state not in ("waiting", *ENDED) and not each.shift_ended}
+        needed |= self._space.keys()
         left = {arm.arm for arm in every if arm.left and (arm.state_age_s or 0.0) > FRESH_S} - needed
         arms = tuple(arm for arm in every if arm.arm not in left)
         now = FleetSnapshot(

@@ -366,7 +366,8 @@ function startPage() {
     const all = [...fleet.arms.values()].sort(byName), here = all.filter(isPresent).length;
     const speed = fleet.speed && fleet.speed !== 1 ? `, ${Number(fleet.speed.toPrecision(3))} times as fast as real time` : "";
     const auctioneers = fleet.auctioneers.filter((each) => each.token).map((each) => each.auctioneer).join(", ");
-    setText(element("summary"), `Fleet time ${clock(fleetTime())}${speed}. ${here} of ${all.length} arms present${fleet.left ? `, ${fleet.left} left` : ""}. ${auctioneers ? `Auctioneer: ${auctioneers}` : "No auctioneer"}. Your role: ${fleet.role}.`);
+    const time = auctioneers || all.some((arm) => arm.token) ? `Fleet time ${clock(fleetTime())}${speed}. ` : "";
+    setText(element("summary"), `${time}${here} of ${all.length} arms present${fleet.left ? `, ${fleet.left} left` : ""}. ${auctioneers ? `Auctioneer: ${auctioneers}` : "No auctioneer"}. Your role: ${fleet.role}.`);
     arms.update(all.map((arm) => [arm.name, arm]), fillArm);
     const listed = [...fleet.jobs.values()], rank = { unfinished: 0, finishing: 1, awarded: 2, waiting: 3 };
     const open = listed.filter(({ state }) => state in rank).sort((a, b) => rank[a.state] - rank[b.state]);
