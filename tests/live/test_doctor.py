@@ -282,6 +282,7 @@ def test_an_arm_that_left_in_order_is_listed_no_longer_unless_somebody_waits_for
     assert ([each.arm for each in at.arms], at.left) == (["b"], ("a",))
     _, found = faults(at)
     assert "Left in order: a." in [each.what for each in found.findings]
+    view.set_token("auction", "au", True)
     alarm = Alarm("m", 1, 5.0, "absent a", "absent", "a is absent.", "a")
     assert not any("An alarm of" in each for each in faults(msgspec.structs.replace(at, alarms=(alarm,)))[0])
     needed = Status("au", 1.0, (JobStatus("j", "unfinished", "a"),)), Status("au", 2.0, (), space={"a": ("*",)})
@@ -292,6 +293,21 @@ def test_an_arm_that_left_in_order_is_listed_no_longer_unless_somebody_waits_for
         assert view.snapshot(160.0).left == ()
         view.update_jobs(Status("au", reply.time_s, (JobStatus("j", "finished", "a"),)), 160.0)
         assert view.snapshot(160.0).left == ("a",)
+
+
+@pytest.mark.parametrize("role", ["auction", "arm"])
+def test_the_space_of_an_arm_that_left_in_order_is_forgotten_with_who_kept_it_closed(role):
+    """The last reply before the end of the shift; b left with its space."""
+    view, last = FleetView("f"), State("a", 0, 0.0, "idle", (), 9.0, leaving=True)
+    view.update("a", last, 100.0)
+    view.update("b", msgspec.structs.replace(last, arm="b", space="s"), 100.0)
+    view.update_jobs(Status("au", 1.0, (), space={"a": ("*",), "b": ("s",)}), 100.0)
+    for there in (True, False):
+        view.set_token(role, "au", there)
+        at = view.snapshot(101.0)
+        assert at.space.keys() == ({"a", "b"} if there else {"b"})
+        assert [each.subject for each in check_fleet(at, None) if each.kind == "space"] == sorted(at.space)
+    assert view.snapshot(160.0).left == ("a",)
 
 
 @pytest.mark.parametrize(

@@ -394,8 +394,11 @@ class FleetView:
         speed = None if self.clock is None else self.clock.speed
         every = [_arm_snapshot(name, self._arms[name], now_s, speed, ended) for name in sorted(self._arms)]
         needed = {each.arm for each in statuses if each.state not in ("waiting", *ENDED) and not each.shift_ended}
-        needed |= self._space.keys()
-        left = {arm.arm for arm in every if arm.left and (arm.state_age_s or 0.0) > FRESH_S} - needed
+        space, gone = self._space, {arm.arm for arm in every if arm.left}
+        if not self._is_served():  # nobody notes any more that they have freed their space
+            space = {arm: spaces for arm, spaces in space.items() if arm not in gone}
+        gone -= needed | space.keys()
+        left = {arm.arm for arm in every if arm.arm in gone and (arm.state_age_s or 0.0) > FRESH_S}
         arms = tuple(arm for arm in every if arm.arm not in left)
         now = FleetSnapshot(
             fleet=self.fleet,
@@ -407,7 +410,7 @@ class FleetView:
             counts=dict(self._count() + self._others),
             changes=dict(self._changes),
             jobs=_most_urgent(statuses, jobs),
-            space=self._space,
+            space=space,
             left=tuple(sorted(left)),
             paused=dict(self._paused),
             left_out=dict(self._left_out),
@@ -420,6 +423,14 @@ class FleetView:
         )
         unserved = why_unserved(now)
         return replace(now, arms=tuple(replace(arm, idle=why_idle(arm, waiting, now, unserved)) for arm in now.arms))
+
+    def _is_served(self) -> bool:
+        """Return whether the last one who sent a message about the jobs is present."""
+        heard = [(each.heard_s, name) for name, each in self._auctioneers.items() if each.heard_s is not None]
+        last = max(heard, default=(0.0, ""))[1]
+        return any(
+            each.token for named in (self._auctioneers, self._arms) for name, each in named.items() if name == last
+        )
 
     def _pause(self, request: ControlRequest) -> None:
         """Apply a pause or its end, which the next status reply confirms."""
