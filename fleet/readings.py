@@ -179,6 +179,18 @@ class TemperatureFilter:
             self.bad[joint] = f"joint {joint + 1} reads {now_c:.1f} °C{jump}"
 
 
+def all_possible(time_s: Array, temp_c: Array) -> bool:
+    """Return whether `TemperatureFilter` accepts all temperatures of an arm, [row] and [row, joint]."""
+    if not len(time_s):
+        return True
+    steps_s, changes_k = np.diff(time_s), np.abs(np.diff(temp_c, axis=0)).max(axis=1)
+    in_range = TEMP_RANGE_C[0] <= temp_c.min() and temp_c.max() <= TEMP_RANGE_C[1]
+    cool = temp_c.shape[1] < 2 or temp_c.min(axis=1).max() <= COOL_C
+    return bool(in_range and cool and (temp_c[0] != 0.0).all()) and bool(
+        (changes_k <= most_temp_change_k(steps_s).max(axis=1)).all()
+    )
+
+
 def _change_k(dt_s: float) -> float:
     return float(most_temp_change_k(max(dt_s, 0.0)).max())
 

@@ -22,7 +22,7 @@ class Telemetry:
     time_s: Array
     """[sample]."""
     mode: Array
-    """Index into `MODES`, int [sample, arm]."""
+    """Index into `MODES`, int [sample, arm]; -1 of an arm that is absent in a recording."""
     q: Array
     """rad, [sample, arm, joint]."""
     qd: Array

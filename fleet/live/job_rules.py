@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Container, Iterable, Mapping, 
 from datetime import timedelta
 from hashlib import blake2b
 from itertools import accumulate
-from math import inf
+from math import inf, isfinite
 from struct import iter_unpack, pack
 from typing import NamedTuple, Self
 
@@ -342,10 +342,16 @@ def waits_since_s(status: JobStatus) -> float | None:
     return max((each for each in (status.release_s, status.accepted_s) if each is not None), default=None)
 
 
-def finish_s(status: JobStatus, state: State | None) -> float | None:
-    """Return the expected fleet time at which a job is finished, by the last state of its arm; None for unknown."""
+def finish_s(status: JobStatus, state: State | None, time_s: float) -> float | None:
+    """Return the expected fleet time at which a job is finished, by the last state of its arm; None for unknown.
+
+    Args:
+        time_s: Fleet time, infinite while unknown: the clock of the arm may be ahead of it.
+    """
     at_work = status.state in ("awarded", "finishing") and state is not None and state.job == status.job
-    return state.time_s + state.busy_s if at_work and state is not None and state.busy_s else None
+    if not at_work or state is None or not state.busy_s or not isfinite(time_s):
+        return None
+    return min(state.time_s, time_s) + state.busy_s
 
 
 def urgency(state: JobState, *, shift_ended: bool) -> int:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 import typer
 
-from fleet.errors import FleetError, Refused, nearest
+from fleet.errors import FleetError, Refused, listed, nearest
 from fleet.fields import argument, option
 from fleet.job import BOUNDS, DWELL_S
 from scenarios.cli import options
@@ -122,12 +122,12 @@ def list_command(
         listener.serve(time.monotonic() + LISTEN_S)
         snapshot = listener.view.snapshot(time.monotonic())
         known = {job.job: job for job in snapshot.jobs if not names or job.job in names}
-        now_s = max((arm.time_s or 0.0 for arm in snapshot.arms), default=0.0)
+        now_s = snapshot.time_s or 0.0
         try:  # results tell neither predicted ends nor why jobs wait
             query = partial(query_statuses, link, names=names or (), timeout_s=REPLY_S)
             now = link.wait(query, REPLY_S).first(keys.of_jobs(link.fleet, "status"))
             known |= {job.job: job for job in now.jobs}
-            now_s = max(now_s, now.time_s)
+            now_s = now.time_s
             if now.next:
                 wanted = len(names or ()) or sum(now.counts.values())
                 say(f"Only {len(now.jobs)} of {wanted} jobs arrived in time.", err_console)
@@ -137,7 +137,8 @@ def list_command(
                 raise FleetError(f"Nobody tells of jobs: {error}{hint}") from error
             say(f"These are the last known changes: {error}", err_console)
     jobs = sorted(known.values(), key=lambda status: status.job)
-    if unknown := sorted({*(names or ())} - {job.job for job in jobs}):
+    unknown = sorted({*(names or ())} - {job.job for job in jobs})
+    if unknown and not jobs:
         near = nearest(unknown[0], [job.job for job in snapshot.jobs])
         raise FleetError(f"The fleet knows no job '{unknown[0]}'{near}")
 
@@ -158,6 +159,8 @@ def list_command(
         print_json(jobs)
     else:
         print_lines(table, ("cycles", "end", "age", "due"))
+    if unknown:
+        raise FleetError(f"The fleet knows no job {listed(map(repr, unknown))}.")
 
 
 def cancel_command(

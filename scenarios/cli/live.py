@@ -243,7 +243,8 @@ def replay_command(
     It begins with the first state: messages of a time before it are published at once.
     """
     from fleet.bus.client import BusClient
-    from scenarios.live.recording import STATE_GAP_S, open_messages, replay
+    from fleet.bus.protocol.keys import STATE_GAP_S
+    from scenarios.live.recording import open_messages, replay
     from scenarios.signals import until_stopped
 
     if endpoint.startswith("tls/"):

@@ -206,8 +206,9 @@ JSON = option("Print JSON.", False, flag="--json")
 OVERWRITE = option("Replace an earlier result.", False)
 
 # Live fleets.
-ENDPOINT = option("Endpoint of the fleet's router.", spec_options.ENDPOINT, env="THERMOFLEET_ENDPOINT")
-FLEET = option("Name of the fleet. Default: the only one at the router.", "", env="THERMOFLEET_FLEET", is_name=True)
+ENDPOINT_VARIABLE, FLEET_VARIABLE = "THERMOFLEET_ENDPOINT", "THERMOFLEET_FLEET"
+ENDPOINT = option("Endpoint of the fleet's router.", spec_options.ENDPOINT, env=ENDPOINT_VARIABLE)
+FLEET = option("Name of the fleet. Default: the only one at the router.", "", env=FLEET_VARIABLE, is_name=True)
 
 _LISTEN = "ros2 listen"
 

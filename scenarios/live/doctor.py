@@ -1,10 +1,12 @@
 """The health of a live fleet, as a report on the terminal."""
 
+import os
 import re
 import socket
 import time
 from collections import Counter
 from dataclasses import replace
+from shlex import quote
 
 import msgspec
 
@@ -16,9 +18,10 @@ from fleet.bus.security.tls import identified, try_connection
 from fleet.errors import BusError, visible
 from fleet.live.monitor.health import MOST_REASONS, ClockProbe, HealthReport, check_health
 from fleet.live.monitor.snapshot import FleetListener, FleetSnapshot
-from scenarios.cli.options import the_fleet
+from scenarios.cli.options import ENDPOINT_VARIABLE, FLEET_VARIABLE, the_fleet
 from scenarios.show.watch import arm_table, jobs_line, space_line
 from scenarios.show.words import clock
+from scenarios.spec.options import ENDPOINT
 from scenarios.terminal import echo, out_console, say
 
 PROBE_EVERY_S, REPLY_S = 0.3, 1.0
@@ -52,7 +55,9 @@ def diagnose(
         none = "No fleet found: no arm or auctioneer has a liveliness token."
         say(f"The router at {endpoint} replies. {several if fleets else none}")
         return False
-    snapshot, report = examine(endpoint, fleet or fleets[0], seconds, auctioneer=auctioneer, expected=expected)
+    named = fleet or fleets[0]
+    reach = reach_of(endpoint, fleet)
+    snapshot, report = examine(endpoint, named, seconds, auctioneer=auctioneer, expected=expected, reach=reach)
     if as_json:
         fields = {"healthy": report.healthy, **msgspec.to_builtins(report)}
         echo(msgspec.json.format(msgspec.json.encode(fields)).decode())
@@ -63,14 +68,31 @@ def diagnose(
     return report.healthy
 
 
+def reach_of(endpoint: str, fleet: str) -> str:
+    """Options of a command for this fleet that differ from their defaults in this shell."""
+    given = (("--endpoint", endpoint, ENDPOINT_VARIABLE, ENDPOINT), ("--fleet", fleet, FLEET_VARIABLE, ""))
+    return " ".join(
+        f"{flag} {quote(value)}"
+        for flag, value, variable, default in given
+        if value and value != os.environ.get(variable, default)
+    )
+
+
 def examine(
-    endpoint: str, fleet: str, seconds: float, *, auctioneer: bool = True, expected: tuple[str, ...] = ()
+    endpoint: str,
+    fleet: str,
+    seconds: float,
+    *,
+    auctioneer: bool = True,
+    expected: tuple[str, ...] = (),
+    reach: str = "",
 ) -> tuple[FleetSnapshot, HealthReport]:
     """Listen to a fleet for some real seconds; return its last snapshot and its health.
 
     Args:
         auctioneer: Whether it should have one.
         expected: Arms that should be present.
+        reach: Options with which a command reaches the fleet.
 
     Raises:
         BusError: no router answered.
@@ -108,6 +130,7 @@ def examine(
         secure=secure,
         expected=expected,
         other_versions=others,
+        reach=reach,
         earlier=snapshots[-BETWEEN] if len(snapshots) >= BETWEEN else None,
         **problems,
     )

@@ -70,8 +70,7 @@ def samples(fleet: FleetSnapshot, alarms: Counter[tuple[str, str]]) -> Iterable[
     reasons = Counter(reason_class(status.reason) for status in waiting)
     for reason in dict.fromkeys((*REASONS.values(), OTHER)):
         yield "waiting_jobs", {"reason": reason}, reasons[reason]
-    now_s = max((arm.time_s for arm in fleet.arms if arm.time_s is not None), default=None)
-    if now_s is not None:
+    if (now_s := fleet.time_s) is not None:
         since_s = [since_s for status in waiting if (since_s := waits_since_s(status)) is not None]
         yield "oldest_waiting_seconds", {}, max(0.0, now_s - min(since_s, default=now_s))
     for arm in fleet.arms:

@@ -26,6 +26,7 @@ from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
 from fleet.bus.protocol.cell import Cell
+from fleet.bus.protocol.keys import STATE_GAP_S
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Alarm, ControlRequest, Operation
 from fleet.errors import FleetError
@@ -70,8 +71,6 @@ _SORTED_BY: dict[Kind, str] = {"telemetry": "tick", "gaps": "first"}
 """Besides the time; `number` for the other kinds."""
 TURN_S = 0.2
 """Real seconds between two checks for a stop request."""
-STATE_GAP_S = 2.0 / (keys.CHANNEL["arm", "state"].limit_hz or math.inf)
-"""Least real seconds between two replayed states of an arm: a router drops those that come within half of it."""
 
 
 class Gap(msgspec.Struct, frozen=True):

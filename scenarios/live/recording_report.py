@@ -12,6 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from statistics import median_low
 from typing import Any  # values of a card
 
 import msgspec
@@ -27,6 +28,7 @@ from fleet.errors import FleetError
 from fleet.events import EVENT_KINDS, Event
 from fleet.heat.effects import arrhenius_rate, life_used, most_drift_m, segment_temperatures
 from fleet.live.job_rules import EXPIRED
+from fleet.readings import BAD_SENSOR, TemperatureFilter, all_possible
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
 from scenarios.live.cell import described_model
@@ -41,6 +43,8 @@ MOST_SAMPLES = 20_000
 """Samples of telemetry in a report, in time."""
 ABSENT_SAMPLES = 30
 """Without a state for this many typical intervals, an arm has no temperature in the report."""
+AHEAD_S = 60.0
+"""Fleet seconds after the end of the fleet, from which on a state without an epoch is of a wrong clock."""
 TELEMETRY = "telemetry of "
 """Before the name of an arm, its states in the card."""
 RESTARTED, ABSENT = "the arm was restarted", "no later state of the arm is recorded"
@@ -80,17 +84,24 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
     epochs = epochs_of(card.senders)
     kinds: tuple[Kind, ...] = ("telemetry", "events", "results", "operations")
     table, log, results, operations = (_of_epoch(read_parts(folder, kind), epochs) for kind in kinds)
+    end_s, ahead = _end_s(table, results, operations), pc.field("epoch") == ""
+    ahead &= pc.field("time_s") > end_s + AHEAD_S
+    wrong = names_text(sorted(set(table.filter(ahead)["arm"].to_pylist())))
+    table, log = (each.filter(~ahead) for each in (table, log))
     arms = tuple(sorted(set(table["arm"].to_pylist())))
     if not arms:
         which = f" of the epoch {epochs[-1]}" if epochs else ""
         raise FleetError(f"'{folder}' holds no state of an arm{which} yet; record longer.")
     limits, model = _cell(scenario, card.cell, arms)
+    table, bad = without_bad_sensors(table, arms)
     alarms = alarms_of(folder) if len(epochs) < 2 else []  # they name no epoch
     if len(epochs) > 1:
         operations = operations.filter(pc.field("epoch") != "")
     reported, telemetry, pauses = arm_events(log), telemetry_of(table, arms), tuple(_pauses(operations))
     work = [] if results.num_rows else work_in_states(table, _absent_s(telemetry))
-    ordered = order_events(reported, (*_returns(results), *returns_in_states(work, reported, pauses, operations)))
+    unreported = unreported_work(results, reported)
+    returned = (*_returns(results), *returns_in_states(work, reported, pauses, operations))
+    ordered = order_events((*reported, *unreported), returned)
     published = tuple(job_records(results))
     ended = {job.job for job in published} | {event.job for event in reported if event.kind == "finish"}
     jobs = (*published, *steered_jobs(operations, ended))
@@ -103,6 +114,9 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
         for event in ordered
         if event.arm in arms
     )
+    begun = {event.job for event in events if event.kind == "finish"}
+    finished = [job.job for job in jobs if job.state == "finished"]
+    unknown = sum(job not in begun for job in finished)
     shown = {
         "status": "running" if card.status == "recording" else card.status,
         "scenario": {"name": card.fleet},
@@ -126,7 +140,17 @@ def open_recording(folder: Path, scenario: Scenario | None = None) -> RecordingL
         halts=(*_silences(alarms, results["time_s"].to_pylist(), arms), *pauses),
         ended_s=min((row["time_s"] for row in results.to_pylist() if row["shift_ended"]), default=math.inf),
         offers=tuple(offer for row in results.to_pylist() for offer in offers_of(row)),
-        remarks=(*_left_out(epochs, card.senders), *([] if results.num_rows else [NO_STATES])),
+        remarks=(
+            *_left_out(epochs, card.senders),
+            *([f"The clock of {wrong} was ahead: what has a time after {clock(end_s)} is left out."] if wrong else []),
+            *([] if results.num_rows else [NO_STATES]),
+            *bad,
+            *(
+                [f"No begin is recorded of {unknown} of {len(finished)} finished jobs: they are in no arm's work."]
+                if unknown
+                else []
+            ),
+        ),
         unknown="" if results.num_rows else "unknown: jobs that no arm finished",
         model=model,
     )
@@ -164,6 +188,15 @@ def _left_out(epochs: Sequence[str], senders: Mapping[str, SenderCount]) -> Iter
     if others:
         names = names_text([*dict.fromkeys(epoch for other in others.values() for epoch in other)])
         yield f"{names_text([*others])} published states of another epoch, {names}: this page leaves them out."
+
+
+def _end_s(table: pa.Table, *others: pa.Table) -> float:
+    """Latest fleet time by messages that name an epoch, and by half of the arms; infinite if none does."""
+    named_s = [each.filter(pc.field("epoch") != "")["time_s"].to_numpy() for each in (table, *others)]
+    if not (ends_s := [float(times_s.max()) for times_s in named_s if len(times_s)]):
+        return math.inf
+    last_s = table.group_by("arm").aggregate([("time_s", "max")])["time_s_max"].to_pylist()
+    return max([*ends_s, *([median_low(last_s)] if last_s else [])])
 
 
 def _cell(
@@ -303,6 +336,55 @@ def job_records(results: pa.Table) -> Iterator[JobRecord]:
             payload_kg=0.0,
             cycles=row["repetitions"],
         )
+
+
+def unreported_work(results: pa.Table, reported: Iterable[Event]) -> list[Event]:
+    """Awards and ends of jobs by their published states, of which the arm reported none: some publish no events.
+
+    An arm without any event counts as home at the end of each job.
+    """
+    there = {(event.kind, event.arm, event.job) for event in reported}
+    heard, out = {arm for _, arm, _ in there}, list[Event]()
+    for row in results.to_pylist():
+        arm, job, state, ended_s = row["arm"], row["job"], row["state"], row["finished_s"]
+        if state == "awarded" and ("award", arm, job) not in there:
+            out.append(Event(time_s=row["time_s"], kind="award", arm=arm, job=job))
+        elif state == "finished" and arm and ended_s is not None and ("finish", arm, job) not in there:
+            there.add(("finish", arm, job))
+            late_s = 0.0 if row["due_s"] is None else max(0.0, ended_s - row["due_s"])
+            out.append(Event(time_s=ended_s, kind="finish", arm=arm, job=job, value=late_s))
+            out += [] if arm in heard else [Event(time_s=ended_s, kind="home", arm=arm, job=job)]
+    return out
+
+
+def without_bad_sensors(table: pa.Table, arms: Sequence[str]) -> tuple[pa.Table, list[str]]:
+    """Return states without impossible temperatures, and a sentence on those that are left out, if there are any.
+
+    They are judged as in a live fleet.
+    """
+    names, all_s = np.array(table["arm"].to_pylist()), table["time_s"].to_numpy()
+    temp_c, wrong = joint_values(table, "temp_c"), dict[str, str]()
+    for arm in arms:
+        rows = np.flatnonzero(names == arm)
+        joints = np.flatnonzero(np.isfinite(temp_c[rows]).any(axis=0))
+        rows = rows[np.isfinite(temp_c[np.ix_(rows, joints)]).all(axis=1)]
+        if not len(joints) or all_possible(all_s[rows], temp_c[np.ix_(rows, joints)]):
+            continue
+        sensors = TemperatureFilter()
+        for row in rows:
+            sensors.update(float(all_s[row]), {int(joint): float(temp_c[row, joint]) for joint in joints})
+            temp_c[row, list(sensors.bad)] = np.nan
+            if sensors.bad:
+                wrong.setdefault(arm, sensors.bad[min(sensors.bad)])
+    if not wrong:
+        return table, []
+    for j in range(JOINTS):
+        name = f"temp_c_{j + 1}"
+        values = pa.array(temp_c[:, j], table.schema.field(name).type, from_pandas=True)
+        table = table.set_column(table.schema.get_field_index(name), name, values)
+    first = next(iter(wrong))
+    which = f"{first}, {wrong[first]}" if len(wrong) > 1 else wrong[first]
+    return table, [f"Impossible temperatures of {names_text([*wrong])} are left out ({which}): {BAD_SENSOR}."]
 
 
 def _returns(results: pa.Table) -> list[Event]:
@@ -470,7 +552,7 @@ def telemetry_of(table: pa.Table, arms: Sequence[str]) -> Telemetry:
     readings = {name: joint_values(table, name) for name in UNITS}
     shape = (len(time_s), len(arms), JOINTS)
     out = {name: np.full(shape, np.nan, np.float32) for name in readings}
-    mode = np.zeros(shape[:2], int)
+    mode = np.full(shape[:2], -1)
     for a, arm in enumerate(arms):
         rows, times = np.flatnonzero(names == arm), own_s[a]
         last = np.maximum(np.searchsorted(times, time_s, side="right") - 1, 0)  # its first one also shortly before
@@ -521,10 +603,10 @@ def _metrics(
     names = {job.job for job in jobs} | {event.job for event in events if event.job}
     step_s = float(telemetry.time_s[1] - telemetry.time_s[0]) if len(telemetry.time_s) > 1 else 0.0
     span_h = float(telemetry.time_s[-1] - telemetry.time_s[0]) / 3600.0
-    seen = np.asarray(np.isfinite(telemetry.temp_c).any(axis=2))
+    seen, known = telemetry.mode >= 0, np.asarray(np.isfinite(telemetry.temp_c).any(axis=(0, 2)))
     finished = len(late_by_job.keys() | {job.job for job in jobs if job.state == "finished"})
     hot = (np.nan_to_num(telemetry.temp_c, nan=-np.inf) > warning_c).any(axis=2)
-    peaks = {arm: float(np.nanmax(telemetry.temp_c[:, a])) for a, arm in enumerate(arms) if seen[:, a].any()}
+    peaks = {arm: float(np.nanmax(telemetry.temp_c[:, a])) for a, arm in enumerate(arms) if known[a]}
     return {
         "jobs": len(names),
         "finished": finished,

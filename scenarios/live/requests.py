@@ -29,6 +29,7 @@ from fleet.bus.protocol.messages import unknown_field
 from fleet.bus.protocol.operator import (
     ALL_ARMS,
     Action,
+    Change,
     Clear,
     Cleared,
     ClearRequest,
@@ -46,6 +47,7 @@ from fleet.job import BOUNDS, KINDS
 from fleet.live.job_client import JobClient
 from fleet.live.monitor.snapshot import describe_status
 from scenarios.cli.options import the_fleet
+from scenarios.show.words import clock
 from scenarios.signals import until_stopped
 from scenarios.spec.job_table import SUFFIXES, read_job_table, shift_begin, with_cell
 from scenarios.table import Column, Table
@@ -208,8 +210,19 @@ def _decode(raw: bytes, kind: type[Decoded], where: str) -> Decoded:
         raise FleetError(f"{where}: {explain(error)}") from error
 
 
+_FIELD = re.compile(r"JobSpec\.(\w+)")
+_OPTIONS = {
+    "name": "--name",
+    "places": "--place",
+    "payload_kg": "--payload",
+    "repetitions": "--repetitions",
+    "dwell_s": "--dwell",
+    "force_n": "--force",
+}
+
+
 def job_of(fields: Mapping[str, object]) -> JobSpec:
-    """The job with these fields.
+    """The job with these fields, which are options of the command line.
 
     Raises:
         FleetError: a field is invalid.
@@ -218,7 +231,8 @@ def job_of(fields: Mapping[str, object]) -> JobSpec:
         msgspec.json.encode(fields)
         return msgspec.convert(fields, JobSpec)
     except msgspec.ValidationError as error:
-        raise FleetError(f"Invalid job: {explain(error)}") from error
+        named = _FIELD.sub(lambda field: _OPTIONS.get(field[1], field[0]), explain(error))
+        raise FleetError(f"Invalid job: {named}") from error
     except UnicodeEncodeError as error:
         raise FleetError(f"--kind and --place must be UTF-8 text (got {error.object!a}).") from error
 
@@ -304,6 +318,9 @@ def _describe(action: Action, reply: Controlled) -> str:
         return f"Paused: {arms or 'none'}.{note}"
     job = reply.job
     state = "settled" if job is None else f"{job.state}, {job.cycles} of {job.repetitions} cycles"
+    if isinstance(action, Change) and job is not None:
+        state += ", no due date" if job.due_s is None else f", due at {clock(job.due_s)}"
+        state += "" if job.value is None else f", value {job.value:g}"
     return f"{action.job}: {state}.{note}"
 
 

@@ -58,7 +58,7 @@ def standstill(log: ShiftLog) -> Standstill | None:
     idle_s = {arm: max((span.end_s for span in spans if span.arm == arm), default=0.0) for arm in log.arms}
     for halt in log.halts:
         idle_s |= {arm: max(idle_s[arm], halt.end_s) for arm in log.arms if halt.arm in ("", arm)}
-    absent = np.all(np.isnan(log.readings.temp_c), axis=-1)
+    absent = log.readings.mode < 0
     for a, arm in enumerate(log.arms):
         idle_s[arm] = max(idle_s[arm], float(log.readings.time_s[absent[:, a]].max(initial=0.0)))
     waiting = [job for job in log.jobs if job.state == "waiting" and not job.release_s > end_s]
@@ -123,10 +123,16 @@ def late_jobs(log: ShiftLog) -> list[LateJob]:
     """Jobs that passed their due date, finished or not but not cancelled: the latest first, abandoned ones last."""
     end_s = min(log.plan.horizon_s, log.ended_s)
     finished = {event.job for event in log.events if event.kind == "finish"}  # its result may not be recorded yet
+    settled = [job for job in log.jobs if job.state == "finished" and job.job not in finished]
     late = [
         LateJob(job=event.job, due_s=event.time_s - event.value, late_s=event.value, state="finished")
         for event in log.events
         if event.kind == "finish" and event.value > 0
+    ]
+    late += [
+        LateJob(job=job.job, due_s=job.due_s, late_s=job.finished_s - job.due_s, state="finished")
+        for job in settled
+        if job.finished_s is not None and job.finished_s > job.due_s
     ]
     late += [
         LateJob(job=job.job, due_s=job.due_s, late_s=end_s - job.due_s, state=job.state)
@@ -467,9 +473,9 @@ def _arm_time(log: ShiftLog, wait: _Wait, end_s: float, halts: Mapping[str, Halt
             time_s[why][arm] += _common_s(begin_s, end_s, span) - halted_s
             free &= (at_s < span.start_s) | (at_s >= span.end_s)
         peak_c = np.fmax.reduce(log.readings.temp_c[free, log.arms.index(arm)], axis=-1, initial=-math.inf)
-        time_s[hot][arm] += step_s * float((peak_c >= log.limits.warning_c).sum())
-        time_s[absent][arm] += step_s * float(np.isneginf(peak_c).sum())
-        time_s[idle][arm] += step_s * float((np.isfinite(peak_c) & (peak_c < log.limits.warning_c)).sum())
+        gone, warm = log.readings.mode[free, log.arms.index(arm)] < 0, peak_c >= log.limits.warning_c
+        for why, such in ((hot, warm), (absent, gone), (idle, ~warm & ~gone)):
+            time_s[why][arm] += step_s * float(such.sum())
     return time_s
 
 

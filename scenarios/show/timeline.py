@@ -21,7 +21,7 @@ Array = np.ndarray
 Span = TypeVar("Span", JobSpan, Outage)
 
 STREAM_COLOURS = ("#4477aa", "#ddaa33", "#228833", "#aa4499", "#66ccee", "#997755", "#999933", "#555566")
-FAILURE, BREAK = "#444444", "#8a8a8a"
+FAILURE, BREAK, UNKNOWN = "#444444", "#8a8a8a", "#9a9a9a"
 OUTAGES = (("fault", "out after a fault", FAULT), ("failure", "failed, not by heat", FAILURE))
 """Kinds of outages that are no breaks, with their names and colours in legends."""
 BAR = {"type": "bar", "orientation": "h"}
@@ -255,10 +255,13 @@ def _heat_map(log: ShiftLog, time: Trace, rows: Trace, unit: str, unit_s: float)
     peak_c = np.zeros((len(arms), len(edges)))
     if samples:
         peak_c = np.fmax.reduce(np.fmax.reduceat(telemetry.temp_c, edges, axis=0), axis=2, initial=-np.inf).T
+    unknown = np.isneginf(peak_c)
     marks = heat_marks(warning_c, error_c)
     low, high = float(marks[0]), float(marks[-1])
-    kelvin = np.clip(np.round((peak_c - low) * 2), 0, 255).astype(np.uint8)
-    shares = (marks - low) / (high - low)
+    zero, most = (1, round(2 * (high - low)) + 1) if unknown.any() else (0, round(2 * (high - low)))
+    kelvin = np.where(unknown, 0, np.clip(np.round((peak_c - low) * 2) + zero, zero, 255)).astype(np.uint8)
+    shares = (zero + 2 * (marks - low)) / most
+    scale = [[0.0, UNKNOWN], [0.5 / most, UNKNOWN], [0.5 / most, HEAT[0]]] if zero else []
     names = [plain(arm) for arm in arms]
     heat = {
         "type": "heatmap",
@@ -270,11 +273,11 @@ def _heat_map(log: ShiftLog, time: Trace, rows: Trace, unit: str, unit_s: float)
         "x": charts.packed_numbers(telemetry.time_s[edges] / unit_s),
         "y": list(range(len(arms))),
         "zmin": 0,
-        "zmax": 2 * (high - low),
-        "colorscale": [[float(share), colour] for share, colour in zip(shares, HEAT, strict=True)],
+        "zmax": most,
+        "colorscale": [*scale, *([float(share), colour] for share, colour in zip(shares, HEAT, strict=True))],
         "colorbar": {
-            "title": {"text": "°C"},
-            "tickvals": [0, 2 * (warning_c - low), 2 * (error_c - low)],
+            "title": {"text": "°C; grey: no reading" if zero else "°C"},
+            "tickvals": [zero, zero + 2 * (warning_c - low), zero + 2 * (error_c - low)],
             "ticktext": [f"{low:g}", f"{warning_c:g}", f"{error_c:g}"],
             "thickness": 12,
             "lenmode": "pixels",

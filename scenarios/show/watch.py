@@ -229,19 +229,20 @@ def _line(*parts: str | tuple[str, str]) -> Text:
 
 
 def heading(fleet: FleetSnapshot) -> Text:
-    """Fleet, number of arms present, auctioneer; or since when there is no connection."""
+    """Fleet, numbers of arms present and left, auctioneer; or since when there is no connection."""
     if fleet.lost_s is not None:
         return _line((fleet.fleet, "bold"), (f"   no connection to the router for {fleet.lost_s:.0f} s", "red"))
     present = sum(arm.present for arm in fleet.arms)
     auctioneers = ", ".join(each.auctioneer for each in fleet.auctioneers if each.token)
-    arms = (f"   {present} of {len(fleet.arms)} arms present", "" if present == len(fleet.arms) else "yellow")
+    left = f", {len(fleet.left)} left" if fleet.left else ""
+    arms = (f"   {present} of {len(fleet.arms)} arms present{left}", "" if present == len(fleet.arms) else "yellow")
     return _line((fleet.fleet, "bold"), arms, f"   auctioneer {auctioneers}" if auctioneers else "   no auctioneer")
 
 
 def time_line(fleet: FleetSnapshot, end_s: float | None = None) -> Text:
     """Fleet time, its speed, and what is left of the shift."""
-    now_s = max((arm.time_s for arm in fleet.arms if arm.time_s is not None and arm.present), default=None)
-    if now_s is None:
+    there = any(each.token for each in (*fleet.arms, *fleet.auctioneers))
+    if (now_s := fleet.time_s) is None or not there:
         return _line("no time yet")
     if end_s is None:
         return _line(clock(now_s))

@@ -275,6 +275,26 @@ def test_a_malformed_state_is_refused_with_words(payload):
         received(State, payload, "arm_0")
 
 
+@pytest.mark.parametrize("number", ["NaN", "nan", "Infinity", "-Infinity", "-inf"])
+@pytest.mark.parametrize(("before", "field"), [(b"18.5", "'headroom_k'"), (b"21.25", "'temp_c'")])
+def test_a_number_that_json_does_not_have_is_named_with_its_field(number, before, field):
+    state = replace(STATE, headroom_k=18.5, temp_c=(20.0, 21.25))
+    payload = encode(state).replace(before, number.encode())
+    at = payload.index(number.encode())
+    says = rf"State\.v4: {field} is {number} \(byte \d+\), which JSON does not have; send a finite number$"
+    with pytest.raises(MalformedMessage, match=says) as raised:
+        received(State, payload, "arm_0")
+    named = int(re.search(r"byte (\d+)", str(raised.value))[1])
+    assert at <= named <= at + len(number) + 1
+
+
+def test_a_name_that_reads_as_no_number_is_not_taken_for_one():
+    payload = encode(replace(STATE, job="NaN")).replace(b'"NaN"', b'"NaN"?')
+    with pytest.raises(MalformedMessage, match="JSON is malformed: ") as raised:
+        received(State, payload, "arm_0")
+    assert "finite" not in str(raised.value)
+
+
 QUOTE = trade.Quote("a", "r", "q", 3.0, "t", 1.0, "idle", 20.0, 1, (trade.JobEstimate("j", (trade.PlanQuote(),)),))
 
 

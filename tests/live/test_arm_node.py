@@ -124,9 +124,10 @@ def make(small, monkeypatch):
 
     def arm(*, plan=None, body=None, model=None, speed=SPEED, limits=LIMITS, warm=True, in_real_time=False, **config):
         clock, line, disk = SimpleNamespace(passed_s=1000.0, now_s=time.monotonic), Line(), Disk()
+        clock.sleep = lambda seconds: setattr(clock, "passed_s", clock.passed_s + seconds)
         if not in_real_time:
             clock.now_s = lambda: clock.passed_s
-            monkeypatch.setattr("fleet.live.arm.node.time", SimpleNamespace(monotonic=clock.now_s))
+            monkeypatch.setattr("fleet.live.arm.node.time", SimpleNamespace(monotonic=clock.now_s, sleep=clock.sleep))
         content = small.work("bench")
         own = small.arm(0, [content])
         steps = {"dt_s": speed / 20, "rng": np.random.default_rng(0), "time_s": START_S, "warm": warm}
@@ -268,6 +269,22 @@ def test_a_stopped_arm_returns_its_job_as_sure(make):
     again = arm.ask(request())
     assert again.capacity == 0
     assert not arm.ask(award(again.quote, name="w2")).accepted
+
+
+@pytest.mark.parametrize("patience_s", [0.0, 1.0])
+def test_a_router_that_limits_the_rate_forwards_the_last_state_of_an_arm(make, monkeypatch, patience_s):
+    """It drops a state that comes less than 10 ms after the one before; the arm is stopped right after a state."""
+    arm, forwarded = make(), [(-1.0, None)]
+
+    def forward(state):
+        if arm.real_s >= forwarded[-1][0] + 1.0 / keys.CHANNEL["arm", "state"].limit_hz:
+            forwarded.append((arm.real_s, state))
+
+    monkeypatch.setattr(arm.node._publish, "state", forward)
+    arm.until(lambda: len(forwarded) > 2)
+    arm.node.retire(arm.real_s + patience_s)
+    last = forwarded[-1][1]
+    assert (last.leaving, last.job, last.space) == (True, "", "")
 
 
 @pytest.mark.parametrize("has_begun", [False, True])

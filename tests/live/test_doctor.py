@@ -14,13 +14,21 @@ from hypothesis import strategies as st
 
 from fleet.bus.client import BusClient, under
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import Clock, ClockRequest, JobStatus
+from fleet.bus.protocol.auction import Clock, ClockRequest, JobStatus, Status
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Alarm
 from fleet.bus.router import Router
-from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_arm, check_fleet, check_health, check_progress
+from fleet.live.monitor.health import (
+    OFFSET_S,
+    ClockProbe,
+    check_arm,
+    check_fleet,
+    check_health,
+    check_left_out,
+    check_progress,
+)
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, AuctioneerSnapshot, FleetSnapshot, FleetView
-from scenarios.live.doctor import show
+from scenarios.live.doctor import reach_of, show
 from scenarios.show.watch import space_line
 from tests import commands
 from tests.waiting import serving
@@ -230,6 +238,8 @@ def test_an_arm_whose_states_are_malformed_is_not_said_to_hang(age_s, says):
     ("change", "why"),
     [
         ({"token": False, "state_age_s": 0.5}, "it publishes its state but shows no token"),
+        ({"token": False, "state_age_s": 0.5, "leaving": True, "away": True}, "it was stopped away from home."),
+        ({"token": False, "state_age_s": 9.5, "leaving": True, "job": "j"}, "it was stopped with a job."),
         ({"token": False, "state_age_s": 3.5}, "it has left, or its process hangs or has ended."),
         ({"state_age_s": 5.0, "state_gap_s": 10.0}, "its last two states came 10.0 s apart"),
         ({"state_age_s": 5.0, "state_gap_s": 0.1}, "it has left, or its process hangs or has ended."),
@@ -256,8 +266,48 @@ def test_an_arm_that_has_left_in_order_is_no_fault(change, left):
     view.update("a", msgspec.structs.replace(last, **change), 100.0)
     assert not view.snapshot(100.0).arms[0].left  # its process runs
     view.set_token("arm", "a", False)
-    (finding,) = check_arm(view.snapshot(110.0).arms[0], None)
+    (finding,) = check_arm(view.snapshot(101.0).arms[0], None)
     assert (finding.level, finding.kind) == (("note", "") if left else ("fault", "absent"))
+
+
+def test_an_arm_that_left_in_order_is_listed_no_longer_unless_somebody_waits_for_it():
+    """A second after it left it is listed, a minute later only with a job that it had or with space that is closed."""
+    view = FleetView("f")
+    view.update("a", State("a", 0, 0.0, "idle", (), 9.0, leaving=True), 100.0)
+    view.update("b", State("b", 0, 0.0, "idle", (), 9.0), 100.0)
+    view.update_jobs(Status("au", 0.0, (JobStatus("j", "finished", "a"),)), 100.0)
+    at = view.snapshot(101.0)
+    assert ([each.arm for each in at.arms], at.left) == (["a", "b"], ())
+    at = view.snapshot(160.0)
+    assert ([each.arm for each in at.arms], at.left) == (["b"], ("a",))
+    _, found = faults(at)
+    assert "Left in order: a." in [each.what for each in found.findings]
+    view.set_token("auction", "au", True)
+    alarm = Alarm("m", 1, 5.0, "absent a", "absent", "a is absent.", "a")
+    assert not any("An alarm of" in each for each in faults(msgspec.structs.replace(at, alarms=(alarm,)))[0])
+    needed = Status("au", 1.0, (JobStatus("j", "unfinished", "a"),)), Status("au", 2.0, (), space={"a": ("*",)})
+    view.update_jobs(Status("au", 0.5, (JobStatus("j", "unfinished", "a", shift_ended=True),)), 160.0)
+    assert view.snapshot(160.0).left == ("a",)
+    for reply in needed:
+        view.update_jobs(reply, 160.0)
+        assert view.snapshot(160.0).left == ()
+        view.update_jobs(Status("au", reply.time_s, (JobStatus("j", "finished", "a"),)), 160.0)
+        assert view.snapshot(160.0).left == ("a",)
+
+
+@pytest.mark.parametrize("role", ["auction", "arm"])
+def test_the_space_of_an_arm_that_left_in_order_is_forgotten_with_who_kept_it_closed(role):
+    """The last reply before the end of the shift; b left with its space."""
+    view, last = FleetView("f"), State("a", 0, 0.0, "idle", (), 9.0, leaving=True)
+    view.update("a", last, 100.0)
+    view.update("b", msgspec.structs.replace(last, arm="b", space="s"), 100.0)
+    view.update_jobs(Status("au", 1.0, (), space={"a": ("*",), "b": ("s",)}), 100.0)
+    for there in (True, False):
+        view.set_token(role, "au", there)
+        at = view.snapshot(101.0)
+        assert at.space.keys() == ({"a", "b"} if there else {"b"})
+        assert [each.subject for each in check_fleet(at, None) if each.kind == "space"] == sorted(at.space)
+    assert view.snapshot(160.0).left == ("a",)
 
 
 @pytest.mark.parametrize(
@@ -282,6 +332,7 @@ def test_an_arm_that_answers_no_awards_is_named():
     _, found = faults(fleet(arm(), arm(arm="b"), left_out=left_out))
     (finding,) = found.findings
     assert finding.what.startswith("b has not answered the last 3 awards: it is awarded no job for a while.")
+    assert "hang" not in check_left_out("b", "gave no valid quote: 'peak_c' is NaN").what
 
 
 def test_an_arm_that_left_earlier_is_missing_only_if_expected():
@@ -325,6 +376,24 @@ def test_text_of_others_forges_no_line_of_the_report(capsys):
     paused = fleet(arm(), paused={"a": "ann'.\nfault: 'b"})
     show("tcp/127.0.0.1:1", paused, check_health(paused, 106.5, [ASKED]))
     assert "note: a is paused by 'ann'.\\nfault: 'b'." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "variables", "options"),
+    [
+        ("tcp/127.0.0.1:7447", {}, ""),
+        ("tcp/127.0.0.1:7661", {}, " --endpoint tcp/127.0.0.1:7661 --fleet 'line 7'"),
+        ("tcp/127.0.0.1:7661", {"THERMOFLEET_ENDPOINT": "tcp/127.0.0.1:7661", "THERMOFLEET_FLEET": "line 7"}, ""),
+    ],
+)
+def test_a_command_that_the_report_names_reaches_the_fleet(monkeypatch, endpoint, variables, options):
+    for name in ("THERMOFLEET_ENDPOINT", "THERMOFLEET_FLEET"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    reach = reach_of(endpoint, "line 7" if options or variables else "")
+    (line,) = faults(fleet(arm(), space={"b": ("*",)}, jobs=()), reach=reach)[1].findings
+    assert line.what.endswith(f"thermofleet arm clear b{options}")
 
 
 def test_a_warning_is_no_fault():

@@ -14,6 +14,7 @@ from fleet.live.book import JobBook
 from fleet.live.job_rules import why_not_ready
 from fleet.live.journal import JobsAccepted
 from fleet.live.leases import expire
+from fleet.live.records import SpaceTaken
 from tests.live.records import awarded, closed
 
 JOB = JobSpec(name="j", kind="hold", places=("bench",))
@@ -198,3 +199,18 @@ def test_what_few_of_many_arms_say_of_a_job_is_not_cut_off() -> None:
     many = no_arm_can({f"arm_{i}": "x" * i for i in range(16, 64)})
     assert len(many) == MAX_REASON
     assert many.endswith("…")
+
+
+def test_a_reason_names_the_absent_arms_of_the_cell_and_those_that_may_take_space() -> None:
+    """b is of the cell and left in order; two other arms left: "acme" in order, "rover" in its space."""
+    book = JobBook(arms=("a", "b"))
+    book.record(JobsAccepted((JOB,)), *(SpaceTaken(arm, space, 0.0) for arm, space in
+                                        (("a", ()), ("b", ()), ("acme", ()), ("rover", ("*",)))))  # fmt: skip
+    auctioneer = Auctioneer("x", book, allocate=lambda _: {}, keep=lambda *_: None, boot="1", real_s=0.0)
+    auctioneer.set_present(frozenset(["a"]))
+    auctioneer.tick(1.0, 1.0)
+    (asked,) = (each for each in auctioneer.out if isinstance(each, QuoteRequest))
+    auctioneer.add_quote(structs.replace(quote("a", plans=(), reason="too far"), auction=asked.auction))
+    auctioneer.tick(1.1, 1.1)
+    (status,) = auctioneer.status(["j"])
+    assert status.reason == "No arm that was asked can do it, and b, rover are not present."

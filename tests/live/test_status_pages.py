@@ -55,9 +55,14 @@ def test_the_first_page_has_unfinished_jobs_then_open_ones_then_the_newest_ended
 def test_the_finish_is_unknown_of_an_arm_that_does_not_say_how_long_it_is_busy():
     status = JobStatus("a", "awarded", "x")
     state = State("x", 1, 100.0, "working", (40.0,), 20.0, job="a")
-    assert finish_s(status, state) is None
-    assert finish_s(status, replace(state, busy_s=30.0)) == 130.0
-    assert finish_s(status, replace(state, busy_s=30.0, job="b")) is None
+    assert finish_s(status, state, 101.0) is None
+    assert finish_s(status, replace(state, busy_s=30.0), 101.0) == 130.0
+    assert finish_s(status, replace(state, busy_s=30.0, job="b"), 101.0) is None
+
+
+def test_the_finish_of_an_arm_whose_clock_is_ahead_counts_from_fleet_time():
+    state = State("x", 1, 5100.0, "working", (40.0,), 20.0, job="a", busy_s=30.0)
+    assert finish_s(JobStatus("a", "awarded", "x"), state, 101.0) == 131.0
 
 
 def test_waiting_jobs_come_in_the_order_of_their_release():

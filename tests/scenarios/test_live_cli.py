@@ -33,6 +33,7 @@ from fleet.bus.protocol.auction import (
     SubmissionReply,
 )
 from fleet.bus.protocol.messages import Info, State
+from fleet.bus.protocol.operator import Controlled, ControlRequest
 from fleet.bus.router import Router
 from fleet.errors import BusError, FleetError, LogError
 from fleet.job import Job, Place, Work
@@ -580,6 +581,41 @@ def test_a_list_of_jobs_has_all_with_their_reasons(endpoint, thermofleet, monkey
     near = " ".join(unknown.split()).partition("knows no job 'unfinished'")[2]
     assert near.startswith("; did you mean 'unfinished_0000'? The most similar of 782: unfinished_0000, finished_0")
     assert near.count("finished_") == 6
+
+
+def test_a_list_of_named_jobs_has_the_known_ones_and_names_the_others(endpoint, thermofleet):
+    desk = ManyJobs(*entries(3, "waiting"))
+    with served(endpoint, desk.reply_on):
+        names = ("waiting_0001", "none", "waiting_0000", "other")
+        code, out, err = thermofleet("job", "list", "--endpoint", endpoint, "--fleet", "f", *names)
+    assert [line.split()[0] for line in out.splitlines()[1:]] == ["waiting_0000", "waiting_0001"]
+    assert (code, " ".join(err.split())) == (2, "Error: The fleet knows no job 'none', 'other'.")
+
+
+@pytest.mark.parametrize(
+    ("due_s", "value", "says"),
+    [(9000.0, 3.0, ", due at 2:30:00, value 3."), (None, None, ", no due date.")],
+)
+def test_the_reply_to_a_change_has_the_new_values(endpoint, thermofleet, due_s, value, says):
+    status = JobStatus("N/3", "waiting", repetitions=5, due_s=due_s, value=value)
+    reply = Controlled("auctioneer", "r", True, job=status)
+    declared = (keys.of_jobs("f", "control"), ControlRequest, lambda _: reply)
+    with served(endpoint, lambda bus: bus.reply_to(*declared)):
+        words = ("job", "change", "N/3", "--due", "9000", "--endpoint", endpoint, "--fleet", "f")
+        assert thermofleet(*words)[1] == f"N/3: waiting, 0 of 5 cycles{says}\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("--name", " leading"), "--name must have 1 to 128 printable characters"),
+        (("--place", " a"), "--place must have 1 to 128 printable characters"),
+    ],
+)
+def test_an_invalid_job_is_told_by_the_option(thermofleet, words, says):
+    code, _, err = thermofleet("job", "submit", "--kind", "hold", "--place", "a", *words)
+    assert (code, says in " ".join(err.split())) == (2, True)
+    assert "JobSpec" not in err
 
 
 def test_a_list_of_jobs_needs_somebody_who_tells(endpoint, thermofleet):

@@ -396,7 +396,7 @@ class Status(msgspec.Struct, frozen=True):
     trouble: str = ""
     """Why its sender accepts and awards no jobs, for example a full disk; "" if it does."""
     left_out: dict[Name, str] = {}
-    """Why an arm is awarded no job for a while, by arm: it has not answered the last awards."""
+    """Why an arm is awarded no job for a while, by arm: such as unanswered awards."""
     counts: dict[JobState, Count] = {}
     """Number of jobs by state, of all jobs: also those of other pages, and those that the request does not name. Empty
     if the sender does not count them; `jobs` then has all."""

@@ -10,6 +10,7 @@ are generated from it. Names of fleets, arms and auctioneers are percent-encoded
 wildcard, a `/` or a leading `@` (no wildcard matches a chunk that begins with `@`, so its history would be lost).
 """
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -136,6 +137,8 @@ CHANNELS: tuple[BusChannel, ...] = (
 )
 CHANNEL: Mapping[tuple[str, str], BusChannel] = {(channel.role, channel.topic): channel for channel in CHANNELS}
 """By role and topic."""
+STATE_GAP_S = 2.0 / (CHANNEL["arm", "state"].limit_hz or math.inf)
+"""Real seconds between two states of which both shall arrive: a router drops one that comes within half of it."""
 PUBLISHED: Mapping[BusChannel, MessageType] = {
     channel: channel.message for channel in CHANNELS if channel.pattern == "publish" and channel.message is not None
 }

@@ -6,6 +6,7 @@ may add some, but not in a `PersonRequest`: there they are refused, as they may 
 this version could misread takes a new version in the schema name.
 """
 
+import re
 from collections.abc import Iterable, Iterator
 from functools import cache
 from math import isfinite
@@ -235,10 +236,28 @@ def decode(kind: type[Message], payload: bytes, sent_encoding: str | None = None
         message: Message = _decoder(kind).decode(payload)
         unknown = unknown_field(kind, payload) if issubclass(kind, PersonRequest) else ""
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise MalformedMessage(f"Not a {schema(kind)}: {error}{_allowed(kind, str(error))}") from error
+        raise MalformedMessage(f"Not a {schema(kind)}: {_problem(kind, payload, str(error))}") from error
     if unknown:
         raise MalformedMessage(f"Not a {schema(kind)}: {unknown}")
     return message
+
+
+MOST_BEFORE = 2000
+"""Bytes before a wrong number in which the name of its field is sought."""
+_NO_NUMBER = re.compile(rb"(?<=[\s:,\[])-?(?:nan|inf(?:inity)?)\b", re.IGNORECASE)
+_AT_BYTE = re.compile(r"\(byte (\d+)\)$")
+_LAST_FIELD = re.compile(rb'"((?:[^"\\]|\\.){1,100})"\s*:[^":{}]*$')
+
+
+def _problem(kind: type, payload: bytes, error: str) -> str:
+    """An error of decoding, with the allowed values, or the field of a number that JSON cannot express."""
+    at = int(match[1]) if (match := _AT_BYTE.search(error)) else -1
+    for number in _NO_NUMBER.finditer(payload, max(0, at - 5), at + 10) if at >= 0 else ():
+        if number.start() <= at <= number.end() + 1:
+            field = _LAST_FIELD.search(payload, max(0, number.start() - MOST_BEFORE), number.start())
+            where = f"'{field[1].decode(errors='replace')}'" if field else "a number"
+            return f"{where} is {number[0].decode()} (byte {at}), which JSON does not have; send a finite number"
+    return f"{error}{_allowed(kind, error)}"
 
 
 def _allowed(kind: type, error: str) -> str:

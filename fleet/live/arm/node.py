@@ -38,7 +38,7 @@ from fleet.bus.protocol.auction import (
     Report,
 )
 from fleet.bus.protocol.consensus import History, HistoryRequest
-from fleet.bus.protocol.keys import STATE_HZ
+from fleet.bus.protocol.keys import STATE_GAP_S, STATE_HZ
 from fleet.bus.protocol.messages import DifficultyScores, Info, State
 from fleet.bus.protocol.operator import ResetReply, ResetRequest, by_whom
 from fleet.difficulty import known_temperatures
@@ -441,6 +441,7 @@ class ArmNode:
             elif not self.executor.active and (self._body.away is not None or self._quoted_s >= reported_s):
                 break
             self.serve(min(until_s, time.monotonic() + POLL_S))
+        time.sleep(STATE_GAP_S)  # no later state makes up for this one
         self._send_state()
 
     def _stop_awards(self, reason: str) -> None:

@@ -291,7 +291,8 @@ class Auctioneer:
         if lease is not None and status.state in ("awarded", "finishing"):
             note = no_progress(lease, status.arm, self._timing, *self.rounds.now_s)
         planned = not waits or bool(status.arm) or self.rounds.is_planned(status.job)  # an arm had it before
-        expected_s, reason = finish_s(status, self.rounds.states.get(status.arm)), joined_reasons(status.reason, note)
+        expected_s = finish_s(status, self.rounds.states.get(status.arm), self.rounds.now_s[1])
+        reason = joined_reasons(status.reason, note)
         return replace(status, cycles=cycles, reason=reason, finish_s=expected_s, not_planned=not planned)
 
     def _counted(self, entry: LeaseEntry) -> int:

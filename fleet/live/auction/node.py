@@ -44,7 +44,7 @@ from fleet.live.journal import EpochBegun, Journal, Started, TimeRecorder, own_r
 from fleet.live.leases import Timing
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.live.rate_limit import RateLimitedWarnings
-from fleet.live.records import BookRecord, JobEntry, SendAward
+from fleet.live.records import MAX_REASON, BookRecord, JobEntry, SendAward
 from fleet.live.space import Excludes, no_conflicts
 
 _LOG = logging.getLogger(__name__)
@@ -237,6 +237,8 @@ class AuctionNode(JobDesk):
         """Real second of the last state of each arm."""
         self._warnings: dict[str, RateLimitedWarnings] = {}
         """By arm with a token."""
+        self._invalid: dict[str, str] = {}
+        """What is wrong with the last quote of an arm; without those whose last quote is valid."""
         self._late: dict[str, int] = {}
         """Number of rounds in a row in which an arm has not quoted in time, by arm with a token."""
         self._declare()
@@ -358,7 +360,7 @@ class AuctionNode(JobDesk):
             for arm, count in self._late.items()
             if count >= MOST_UNANSWERED
         }
-        return {**late, **self.auctioneer.rounds.back_offs.unanswering, **self._epochs.unreadable}
+        return {**late, **self._invalid, **self.auctioneer.rounds.back_offs.unanswering, **self._epochs.unreadable}
 
     def _submit(self, submission: Submission) -> SubmissionReply:
         return self._accept_jobs(submission, self._reserved)
@@ -395,6 +397,7 @@ class AuctionNode(JobDesk):
             self._state_s.pop(arm, None)
             self._warnings.pop(arm, None)
             self._late.pop(arm, None)
+            self._invalid.pop(arm, None)
             self._epochs.forget(arm)
             self.auctioneer.rounds.back_offs.forget(arm)
 
@@ -492,12 +495,16 @@ class AuctionNode(JobDesk):
             self._warn(arm, "late", f"has not quoted within {self._timing.window_s:g} s: it is awarded no job.")
         for key, reason in replies.refused.items():
             if reason and (arm := _arm_of(key)):
-                self._note_unusable_quote(auction, arm, "invalid", f"gave no valid quote: {reason.rstrip('.')}")
+                why = f"gave no valid quote: {reason.rstrip('.')}"
+                self._note_unusable_quote(auction, arm, "invalid", why)
+                if arm in self._tokens:
+                    self._invalid[arm] = why[:MAX_REASON]
             elif reason:
                 self._warnings.setdefault("", RateLimitedWarnings(""))("quote", f"No quote: {reason}")
         self.auctioneer.end_quotes(auction)
 
     def _add_quote(self, request: QuoteRequest, quote: Quote) -> None:
+        self._invalid.pop(quote.arm, None)
         if quote.auction != request.auction:
             self._note_unusable_quote(request.auction, quote.arm, "round", "quoted for another round")
             return

@@ -73,7 +73,7 @@ class Bidding:
     """Names of the spaces that each arm may take."""
     excludes: Excludes = no_conflicts
     absent: frozenset[str] = frozenset()
-    """Arms that may take space and are not present."""
+    """Arms that may take space, or belong to the cell, and are not present."""
     unasked: Mapping[str, str] = field(default_factory=dict[str, str])
     """Why other present arms have not quoted, by arm."""
     excluded: Mapping[str, Mapping[str, str]] = field(default_factory=dict[str, Mapping[str, str]])
@@ -235,12 +235,15 @@ def _without_conflicts(bidding: Bidding, pairs: Iterable[tuple[str, Assignment]]
     return kept
 
 
-def no_arm_can(reasons: Mapping[str, str], *, all_known: bool = True) -> str:
+def no_arm_can(reasons: Mapping[str, str], *, all_known: bool = True, absent: Set[str] = frozenset()) -> str:
     """Return the reason of a job that no arm can do, from the reasons of the arms.
 
     Args:
         all_known: Whether all present arms have answered.
+        absent: Arms that are not present, of which it is unknown whether they can.
     """
+    if absent:
+        return _no_arm(reasons, [_not_present(absent)], "arm")
     start = f"No arm {'' if all_known else 'that has answered '}can do it: "
     each = start + "; ".join(f"{arm}: {reason}" for arm, reason in sorted(reasons.items())) + "."
     if len(each) <= MAX_REASON:
@@ -761,7 +764,7 @@ class Rounds:
             busy=self._book.busy_stations(),
             taken=taken,
             excludes=self._excludes,
-            absent=frozenset(taken.keys() - self.present),
+            absent=frozenset(arm for arm in taken if taken[arm] or arm in self._book.arms) - self.present,
             unasked={arm: self._why_unasked(arm, closing, real_s) for arm in self.present - quotes.keys()},
             excluded=excluded,
             unfit={arm: why for arm in quotes if (why := self.sensors[arm].why_unfit)},

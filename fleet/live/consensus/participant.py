@@ -301,14 +301,20 @@ class Participant:
     def _status_of(self, entry: JobEntry) -> JobStatus:
         """Return the status of a job, with the expected finish of one in work."""
         status = self.book.status_of(entry)
-        return replace(status, finish_s=finish_s(status, self.states.get(status.arm)))
+        return replace(status, finish_s=finish_s(status, self.states.get(status.arm), self._time_s))
+
+    @property
+    def _absent(self) -> frozenset[str]:
+        return self.granter.roster - self._present - {self.name}
 
     def _refusal(self, job: str) -> str:
         """Return why no arm can do a job, or none works; "" if one can, or this arm does not know whether it can."""
         if (pauser := self.book.operations.paused.get(ALL_ARMS)) is not None:
             return f"All arms are paused{by_whom(pauser)}."
         reasons = self._refusals.of_all(job, {self.name})
-        return no_arm_can(reasons, all_known=self._present <= reasons.keys()) if reasons else ""
+        if not reasons:
+            return ""
+        return no_arm_can(reasons, all_known=self._present <= reasons.keys(), absent=self._absent - reasons.keys())
 
     def all_settled(self, real_s: float) -> bool:
         """Return whether every present arm, a majority at least, knows that every job is settled."""
@@ -426,6 +432,7 @@ class Participant:
             busy=book.busy_stations(),
             taken=book.taken_space(),
             excludes=self._excludes,
+            absent=self._absent,
             unfit=unfit | {arm: f"is paused{by_whom(paused[arm])}" for arm in bids if arm in paused},
             at_work=frozenset(arm for arm, _ in book.at_work().values()),
         )

@@ -74,6 +74,11 @@ class AlarmList:
             if alarm.ended_s is None and alarm.monitor in (gone, self.monitor):
                 self._found_s.setdefault(name, math.inf)
 
+    def lasts(self, finding: Finding) -> bool:
+        """Return whether a finding has an alarm that lasts."""
+        alarm = self.alarms.get(alarm_name(finding.kind, finding.subject))
+        return alarm is not None and alarm.ended_s is None
+
     def update(
         self,
         findings: Sequence[Finding],

@@ -191,7 +191,7 @@ class AsyncBridge:
         def acknowledge(done: Callable[[Alarm | Refused], None]) -> None:
             now = self._listener.view.snapshot(time.monotonic(), 0)
             try:
-                changed = self._alarms.acknowledge(alarm, by, fleet_time_s(now), datetime.now(UTC))
+                changed = self._alarms.acknowledge(alarm, by, now.time_s or 0.0, datetime.now(UTC))
             except Refused as refused:
                 done(refused)
             else:
@@ -253,16 +253,17 @@ class AsyncBridge:
         now = self._listener.view.snapshot(real_s)
         if lost := check_connection(now):
             self._earlier.clear()
+            self._known = [each for each in self._known if self._alarms.lasts(each)]  # no other one begins meanwhile
         else:
             earlier = self._earlier[0] if len(self._earlier) == self._earlier.maxlen else None
             complaints = self._link.complaints(real_s - FRESH_S)
             self._known = check_fleet(now, earlier, malformed=complaints_of_states(now, complaints))
             self._earlier.append(now)
         findings = [*self._known, *lost]
-        heard = {each.arm for each in now.arms} | {each.job for each in now.jobs}
+        heard = {each.arm for each in now.arms} | {*now.left} | {each.job for each in now.jobs}
         heard |= {each.auctioneer for each in now.auctioneers if each.heard_age_s is not None}
         findings += self._more_findings()
-        for alarm in self._alarms.update(findings, fleet_time_s(now), real_s, heard, now.speed or 1.0):
+        for alarm in self._alarms.update(findings, now.time_s or 0.0, real_s, heard, now.speed or 1.0):
             self._publish(alarm)
         alarms = self._alarms.alarms
         told, self._told = self._told, {name: (each.ended_s is None, each.by) for name, each in alarms.items()}
@@ -300,8 +301,3 @@ def first_reply(replies: Replies[Reply], key: str) -> Reply:
         return replies.first(key)
     except Refused as error:
         raise type(error)(f"The {replier(key)} refused: {error}") from error
-
-
-def fleet_time_s(fleet: FleetSnapshot) -> float:
-    """Fleet time, by the last message of any arm."""
-    return max((arm.time_s for arm in fleet.arms if arm.time_s is not None), default=0.0)

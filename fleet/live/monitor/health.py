@@ -15,6 +15,7 @@ from fleet.bus.client import under
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.operator import ALL_ARMS, by_whom
 from fleet.bus.security.tls import UNKNOWN_CERTIFICATE
+from fleet.errors import listed
 from fleet.live.clock import FleetClock
 from fleet.live.job_rules import NO_CYCLE
 from fleet.live.monitor.snapshot import FRESH_S, SILENT_S, ArmSnapshot, FleetSnapshot
@@ -120,6 +121,7 @@ def check_health(
     expected: Sequence[str] = (),
     other_versions: Sequence[str] = (),
     earlier: FleetSnapshot | None = None,
+    reach: str = "",
 ) -> HealthReport:
     """Check a fleet that was listened to for a while.
 
@@ -132,6 +134,7 @@ def check_health(
         expected: Arms that should be present: one that left earlier leaves no trace.
         other_versions: A sentence on each participant that uses another version of the bus.
         earlier: Snapshot of a second before or more; None: whether jobs wait in vain is not checked.
+        reach: Options with which a command reaches this fleet.
     """
     trips_s = [probe.answered_s - probe.asked_s for probe in probes]
     clock = best_clock(probes)
@@ -144,6 +147,7 @@ def check_health(
             earlier,
             {a: off_s for a, off_s in offsets_s.items() if abs(off_s - common_s) > OFFSET_S},
             complaints_of_states(fleet, complaints),
+            reach,
         ),
     ]
     if abs(common_s) > OFFSET_S:
@@ -154,16 +158,18 @@ def check_health(
     shown = {arm.arm for arm in fleet.arms if arm.token}
     if missing := [name for name in expected if name not in shown]:
         findings.append(Finding("fault", f"Not present: {', '.join(missing)}."))
-    listed = {arm.arm for arm in fleet.arms} | {*expected}
+    accounted = {arm.arm for arm in fleet.arms} | {*expected, *fleet.left}
     findings += [
         Finding("fault", f"An alarm of '{alarm.monitor}' that nobody has acknowledged: {alarm.what}")
         for alarm in fleet.alarms
-        if alarm.kind == "absent" and alarm.ended_s is None and not alarm.by and alarm.subject not in listed
+        if alarm.kind == "absent" and alarm.ended_s is None and not alarm.by and alarm.subject not in accounted
     ]
     if not any(arm.present for arm in fleet.arms):
         unheard = secure and not any(arm.token for arm in fleet.arms)
         hint = UNKNOWN_CERTIFICATE if unheard else ""
         findings.append(Finding("fault", f"No arm is present: none shows both a token and a fresh state.{hint}"))
+    if fleet.left:
+        findings.append(Finding("note", f"Left in order: {listed(fleet.left)}."))
     if trips_s and median(trips_s) > SLOW_S:
         findings.append(Finding("warning", f"The router is slow: a round trip takes {1000 * median(trips_s):.0f} ms."))
     if malformed:
@@ -189,6 +195,7 @@ def check_fleet(
     earlier: FleetSnapshot | None,
     offsets_s: Mapping[str, float] = NO_OFFSETS,
     malformed: Mapping[str, str] = NO_COMPLAINTS,
+    reach: str = "",
 ) -> list[Finding]:
     """What snapshots show of arms, jobs and space: the findings that raise alarms, except that of a lost connection.
 
@@ -196,6 +203,7 @@ def check_fleet(
         earlier: As in `check_health`.
         offsets_s: As in a report, of the arms whose offset is to be checked.
         malformed: Why the last state of an arm was dropped as malformed, as far as it is known.
+        reach: As in `check_health`.
     """
     arms = (
         finding
@@ -210,13 +218,14 @@ def check_fleet(
         *check_awards(fleet),
         *check_jobs(fleet),
         *check_progress(fleet, earlier),
-        *check_space(fleet),
+        *check_space(fleet, reach),
     ]
 
 
 def check_left_out(arm: str, why: str) -> Finding:
     """Return the finding of an arm that is awarded no jobs for a while."""
-    return Finding("warning", f"{arm} {why}: it is awarded no job for a while. Its process may hang.")
+    hangs = " Its process may hang." if why.startswith("has not ") else ""
+    return Finding("warning", f"{arm} {why}: it is awarded no job for a while.{hangs}")
 
 
 def check_pauses(fleet: FleetSnapshot) -> list[Finding]:
@@ -233,9 +242,14 @@ def _paused(arms: Sequence[str]) -> str:
 
 
 def check_connection(fleet: FleetSnapshot) -> list[Finding]:
-    """Check that the listener has a connection to the router: without one a snapshot shows an earlier fleet."""
+    """Check that the listener has a connection to the router: without one a snapshot shows an earlier fleet.
+
+    It is as it should be that a router ends after all arms.
+    """
     if fleet.lost_s is None:
         return []
+    if (fleet.arms or fleet.left) and all(arm.leaving for arm in fleet.arms):
+        return [Finding("note", "All arms have left, and the router has ended.")]
     why = (
         fleet.expiry.rstrip(".")
         or "The connection to the router is lost: the router has ended, hangs, or is unreachable"
@@ -321,7 +335,7 @@ def _is_at_work(fleet: FleetSnapshot) -> bool:
     return awarded > 0 or any(arm.present and arm.mode == "working" for arm in fleet.arms)
 
 
-def check_space(fleet: FleetSnapshot) -> list[Finding]:
+def check_space(fleet: FleetSnapshot, reach: str = "") -> list[Finding]:
     """Check that no arm that is not present keeps space closed; a fault if jobs wait for it."""
     present = {arm.arm for arm in fleet.arms if arm.present}
     silent_s = {arm.arm: arm.state_age_s for arm in fleet.arms if arm.state_age_s is not None}
@@ -334,7 +348,7 @@ def check_space(fleet: FleetSnapshot) -> list[Finding]:
                 "fault" if waits else "warning",
                 f"The space of {arm} stays closed to other arms, as {arm} is not present{since}"
                 f"{f'; {waits} job(s) wait for it' if waits else ''}. If you have seen that it is at home or removed, "
-                f"and is switched off: thermofleet arm clear {quote(arm)}",
+                f"and is switched off: thermofleet arm clear {' '.join(filter(None, (quote(arm), reach)))}",
                 "space",
                 arm,
                 lasting=f"The space of {arm} stays closed to other arms, as it is not present. Clear it once a person "
@@ -394,14 +408,16 @@ def check_arm(arm: ArmSnapshot, offset_s: float | None, *, malformed: str = "") 
         cause, why = "its states are malformed.", f"its states are malformed: {malformed}"
     elif arm.token and arm.state_gap_s is not None and arm.state_gap_s > FRESH_S:
         why = cause = f"its last two states came {arm.state_gap_s:.1f} s apart, and at least two a second are needed."
-    if not arm.token:
+    if arm.leaving and not arm.token:
+        problem = f"was stopped {'away from home' if arm.away else 'with a job'}."
+        why = f"it {problem}"
+    elif not arm.token:
         problem = "publishes its state but shows no token: it left, or another process uses its name."
+        why = f"it {problem}" if age_s is not None and age_s <= FRESH_S else why
     elif age_s is None:
         problem = f"shows its token but publishes no {'valid ' if malformed else ''}state: {cause}"
     elif age_s > FRESH_S:
         problem = f"is stale, with a last state {age_s:.1f} s old: {cause}"
-    if not arm.token and age_s is not None and age_s <= FRESH_S:
-        why = f"it {problem}"
     absent = f"{arm.arm} is absent: {why}"
     findings = [Finding("fault", f"{arm.arm} {problem}", "absent", arm.arm, lasting=absent)] if problem else []
     if arm.doubled:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from datetime import timedelta
 from functools import partial
 from itertools import repeat
+from statistics import median_low
 from typing import Literal, TypeVar
 
 import msgspec
@@ -36,6 +37,7 @@ from fleet.bus.protocol.messages import DifficultyScores, Info, State
 from fleet.bus.protocol.operator import ALL_ARMS, Alarm, ControlRequest, Operation, Pause, Resume, by_whom
 from fleet.errors import BusError
 from fleet.events import EVENT_KINDS
+from fleet.live.clock import FleetClock
 from fleet.live.job_client import query_statuses
 from fleet.live.job_rules import Position, urgency
 from fleet.live.sensors import ArmSensors
@@ -124,6 +126,8 @@ class ArmSnapshot(msgspec.Struct, frozen=True):
     """Fleet seconds until it is home with its current job done."""
     away: bool = False
     """It reports that it is away from home."""
+    leaving: bool = False
+    """Its last state says that its process ends in order."""
     left: bool = False
     """It has ended in order: it shows no token, and its last state says so, without job and space."""
     doubled: bool = False
@@ -170,6 +174,7 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
 
     fleet: str
     arms: tuple[ArmSnapshot, ...]
+    """Without those that left in order `FRESH_S` ago or earlier and neither have a job nor close space."""
     auctioneers: tuple[AuctioneerSnapshot, ...]
     counts: dict[str, int]
     """Number of all jobs by state."""
@@ -178,10 +183,14 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
     that have ended are dropped first."""
     space: dict[str, tuple[str, ...]] = {}
     """Names of the spaces that are closed to other arms, by arm, from the last status reply."""
+    left: tuple[str, ...] = ()
+    """Names of the arms that are left out of `arms`."""
     paused: dict[str, str] = {}
     """Who paused an arm, by arm, from the last status reply; "*" for all arms."""
     left_out: dict[str, str] = {}
     """Why an arm is awarded no job for a while, by arm, from the last status reply."""
+    time_s: float | None = None
+    """Fleet time, of whoever replies about the jobs; without a reply the median of present arms. None if unknown."""
     speed: float | None = None
     """Fleet seconds per real second."""
     changes: dict[str, int] = {}
@@ -276,8 +285,8 @@ class FleetView:
     """State of a fleet, as its messages show it."""
 
     fleet: str
-    speed: float | None = None
-    """Fleet seconds per real second; None while unknown."""
+    clock: FleetClock | None = None
+    """Fleet time and its speed; None while nobody has replied."""
     began_s: float | None = None
     """Real second at which a listener began."""
     heard_s: float = math.inf
@@ -382,10 +391,18 @@ class FleetView:
         statuses = [job.status for job in self._jobs.values()]
         ended = {status.job for status in statuses if status.state in ("finished", "unfinished")}
         waiting = {status.job: status.reason for status in statuses if status.state == "waiting"}
-        arms = (_arm_snapshot(name, self._arms[name], now_s, self.speed, ended) for name in sorted(self._arms))
+        speed = None if self.clock is None else self.clock.speed
+        every = [_arm_snapshot(name, self._arms[name], now_s, speed, ended) for name in sorted(self._arms)]
+        needed = {each.arm for each in statuses if each.state not in ("waiting", *ENDED) and not each.shift_ended}
+        space, gone = self._space, {arm.arm for arm in every if arm.left}
+        if not self._is_served():  # nobody notes any more that they have freed their space
+            space = {arm: spaces for arm, spaces in space.items() if arm not in gone}
+        gone -= needed | space.keys()
+        left = {arm.arm for arm in every if arm.arm in gone and (arm.state_age_s or 0.0) > FRESH_S}
+        arms = tuple(arm for arm in every if arm.arm not in left)
         now = FleetSnapshot(
             fleet=self.fleet,
-            arms=tuple(arms),
+            arms=arms,
             auctioneers=tuple(
                 AuctioneerSnapshot(name, each.token, _age_s(each.heard_s, now_s), each.trouble)
                 for name, each in sorted(self._auctioneers.items())
@@ -393,10 +410,12 @@ class FleetView:
             counts=dict(self._count() + self._others),
             changes=dict(self._changes),
             jobs=_most_urgent(statuses, jobs),
-            space=self._space,
+            space=space,
+            left=tuple(sorted(left)),
             paused=dict(self._paused),
             left_out=dict(self._left_out),
-            speed=self.speed,
+            time_s=_median_s(arms) if self.clock is None else self.clock.now_s(now_s),
+            speed=speed,
             alarms=tuple(self.alarms.values()),
             listened_s=_age_s(self.began_s, now_s) or 0.0,
             lost_s=_age_s(self.lost_s, now_s),
@@ -404,6 +423,14 @@ class FleetView:
         )
         unserved = why_unserved(now)
         return replace(now, arms=tuple(replace(arm, idle=why_idle(arm, waiting, now, unserved)) for arm in now.arms))
+
+    def _is_served(self) -> bool:
+        """Return whether the last one who sent a message about the jobs is present."""
+        heard = [(each.heard_s, name) for name, each in self._auctioneers.items() if each.heard_s is not None]
+        last = max(heard, default=(0.0, ""))[1]
+        return any(
+            each.token for named in (self._auctioneers, self._arms) for name, each in named.items() if name == last
+        )
 
     def _pause(self, request: ControlRequest) -> None:
         """Apply a pause or its end, which the next status reply confirms."""
@@ -474,7 +501,8 @@ class FleetListener:
             self._status_due_s = asked_s + STATUS_EVERY_S
             fleet, done = self._link.fleet, partial(self._statuses, asked_s)
             try:
-                self._link.query(keys.of_clock(fleet), ClockRequest(), Clock, self._clocks, timeout_s=STATUS_EVERY_S)
+                clocks = partial(self._clocks, asked_s)
+                self._link.query(keys.of_clock(fleet), ClockRequest(), Clock, clocks, timeout_s=STATUS_EVERY_S)
                 query_statuses(self._link, done, timeout_s=STATUS_EVERY_S, most=MAX_JOBS)
             except BusError as error:
                 _LOG.warning("%s", error)
@@ -492,9 +520,9 @@ class FleetListener:
         if self.view.set_token(role, name, present):
             self._on_presence(role, name, present)
 
-    def _clocks(self, answers: Replies[Clock]) -> None:
+    def _clocks(self, asked_s: float, answers: Replies[Clock]) -> None:
         for reply in answers.messages.values():
-            self.view.speed = reply.speed
+            self.view.clock = FleetClock(reply.speed).set_to(asked_s, asked_s + answers.took_s, reply.time_s)
 
     def _statuses(self, asked_s: float, answers: Replies[Status]) -> None:
         replies = list(answers.messages.values())
@@ -581,6 +609,13 @@ def bids_of(arm: ArmSnapshot, waiting: Container[str]) -> int:
     return sum(job in waiting and score != JobScore() for job, score in arm.scores.items())
 
 
+def _median_s(arms: Sequence[ArmSnapshot]) -> float | None:
+    """Median of the times of the present arms, or of all without one: an arm may have a wrong clock."""
+    times_s = [(arm.present, arm.time_s) for arm in arms if arm.time_s is not None]
+    some = any(present for present, _ in times_s)
+    return median_low(time_s for present, time_s in times_s if present or not some) if times_s else None
+
+
 def _age_s(at_s: float | None, now_s: float) -> float | None:
     return None if at_s is None else now_s - at_s
 
@@ -638,6 +673,7 @@ def _arm_snapshot(name: str, arm: _Arm, now_s: float, speed: float | None, ended
         job=state.job if state else "",
         busy_s=state.busy_s if state else 0.0,
         away=bool(state and state.space),
+        leaving=bool(state and state.leaving),
         left=bool(not arm.token and state and state.leaving and not state.job and not state.space),
         doubled=arm.is_doubled(now_s),
         scores={job: score for job, score in by_job if job not in ended},

@@ -10,7 +10,7 @@ const STATES = {
 
 function startPage() {
   const gateway = makeGateway();
-  const fleet = { role: "monitor", cell: null, name: "", paused: {}, speed: null, arms: new Map(), jobs: new Map(), auctioneers: [], counts: {}, refresh: poll, now: fleetTime };
+  const fleet = { role: "monitor", cell: null, name: "", paused: {}, speed: null, timeS: null, timeAtMs: 0, left: 0, arms: new Map(), jobs: new Map(), auctioneers: [], counts: {}, refresh: poll, now: fleetTime };
   const actions = makeActions(gateway, fleet);
   const offers = new Map(), awards = [], noted = new Set();
   const counted = { updates: 0, states: 0 };
@@ -24,8 +24,7 @@ function startPage() {
   const ageOf = (arm) => arm.state ? (performance.now() - arm.atMs) / 1000 : null;
   const isPresent = (arm) => arm.token && arm.state !== null && ageOf(arm) <= FRESH_S;
   function fleetTime() {
-    const times = [...fleet.arms.values()].filter(isPresent).map((arm) => arm.state.time_s);
-    return times.length ? Math.max(...times) : 0;
+    return fleet.timeS === null ? 0 : fleet.timeS + (fleet.speed || 0) * (performance.now() - fleet.timeAtMs) / 1000;
   }
 
   // Messages
@@ -35,7 +34,7 @@ function startPage() {
     if (noted.has(key)) return;
     noted.add(key);
     if (noted.size > 4 * MOST_NOTES) noted.delete(noted.values().next().value);
-    const atS = timeS ?? Math.max(0, ...[...fleet.arms.values()].map((arm) => arm.state ? arm.state.time_s : 0));
+    const atS = timeS ?? fleetTime();
     const row = make("tr", kind ? { class: kind } : {}, ...[clock(atS), `${what.replace(/\.$/, "")}.`].map((text) => make("td", {}, visible(text))));
     row.dataset.timeS = atS;
     const body = element("journal").tBodies[0];
@@ -198,7 +197,7 @@ function startPage() {
   async function poll() {
     const snapshot = await gateway.request(`/v4/fleet?jobs=${MOST_JOBS}`);
     const nowMs = performance.now();
-    Object.assign(fleet, { name: snapshot.fleet, counts: snapshot.counts, paused: snapshot.paused, speed: snapshot.speed, auctioneers: snapshot.auctioneers, alarms: snapshot.alarms });
+    Object.assign(fleet, { name: snapshot.fleet, counts: snapshot.counts, paused: snapshot.paused, speed: snapshot.speed, timeS: snapshot.time_s, timeAtMs: nowMs, auctioneers: snapshot.auctioneers, alarms: snapshot.alarms });
     const total = (field) => snapshot.arms.reduce((sum, one) => sum + one[field], 0), workedS = total("worked_s"), heated = total("heat_n2m2s");
     for (const one of snapshot.arms) {
       const arm = armOf(one.arm);
@@ -207,6 +206,12 @@ function startPage() {
       if (one.state_age_s !== null) arm.atMs = Math.max(arm.atMs, nowMs - 1000 * one.state_age_s);
       arm.difficultyMs = one.difficulty_age_s === null ? null : nowMs - 1000 * one.difficulty_age_s;
     }
+    for (const name of snapshot.left) {
+      fleet.arms.delete(name);
+      if (view && index.has(name)) view.setMode(index.get(name), -1);
+      present.delete(name);
+    }
+    fleet.left = snapshot.left.length;
     for (const status of snapshot.jobs) setJob(status);
     fleet.jobs = new Map(snapshot.jobs.map((status) => [status.job, status])); // of those that have ended, the newest first
     for (const { alarm, what, by, time_s: timeS, began_s: beganS, ended_s: endedS } of snapshot.alarms) {
@@ -361,7 +366,8 @@ function startPage() {
     const all = [...fleet.arms.values()].sort(byName), here = all.filter(isPresent).length;
     const speed = fleet.speed && fleet.speed !== 1 ? `, ${Number(fleet.speed.toPrecision(3))} times as fast as real time` : "";
     const auctioneers = fleet.auctioneers.filter((each) => each.token).map((each) => each.auctioneer).join(", ");
-    setText(element("summary"), `Fleet time ${clock(fleetTime())}${speed}. ${here} of ${all.length} arms present. ${auctioneers ? `Auctioneer: ${auctioneers}` : "No auctioneer"}. Your role: ${fleet.role}.`);
+    const time = auctioneers || all.some((arm) => arm.token) ? `Fleet time ${clock(fleetTime())}${speed}. ` : "";
+    setText(element("summary"), `${time}${here} of ${all.length} arms present${fleet.left ? `, ${fleet.left} left` : ""}. ${auctioneers ? `Auctioneer: ${auctioneers}` : "No auctioneer"}. Your role: ${fleet.role}.`);
     arms.update(all.map((arm) => [arm.name, arm]), fillArm);
     const listed = [...fleet.jobs.values()], rank = { unfinished: 0, finishing: 1, awarded: 2, waiting: 3 };
     const open = listed.filter(({ state }) => state in rank).sort((a, b) => rank[a.state] - rank[b.state]);

@@ -112,6 +112,15 @@ def test_what_is_wrong_with_a_quote_is_logged_once_and_is_the_reason_of_the_job(
     assert says in line
 
 
+def test_an_arm_without_valid_quotes_is_named_in_the_status_until_it_gives_one(one):
+    bad = [True]
+    one.intercept("arm_0", "quote", lambda request, reply_to: (malformed if bad[0] else replace)(reply_to(request)))
+    one.submit(job("a", 200))
+    one.until(lambda: "gave no valid quote: Not a" in boss(one)._left_out().get("arm_0", ""))
+    bad[0] = False
+    one.until(lambda: not boss(one)._left_out())
+
+
 def test_quotes_under_no_valid_key_are_logged_at_a_limited_rate(one):
     refusal = Replies(refused={"thermofleet/v4/f/arm/.dot/quote": "'…/.dot/quote' is no key of this bus."})
     for _ in range(3):

@@ -23,8 +23,7 @@ def estimate(jobs, *_):
     return tuple(JobEstimate(job.name, (PlanQuote(difficulty=0.5, duration_s=1.0),)) for job in jobs)
 
 
-@pytest.fixture
-def participant():
+def make_participant(arms=ARMS, estimate=estimate):
     executor = SimpleNamespace(
         arm="arm_0", active=(), spare_capacity=1, has_pending_reports=False, pending_reports=lambda: ()
     )
@@ -32,14 +31,19 @@ def participant():
     arm = SimpleNamespace(
         executor=executor, estimate=estimate, unfit=lambda: "", space=(), answer_award=None, space_of=lambda *_: ""
     )
-    granter = Granter("arm_0", ARMS, JobBook(is_central=False), lambda *_: None, real_s=0.0)
+    granter = Granter("arm_0", arms, JobBook(is_central=False), lambda *_: None, real_s=0.0)
     granter.add_jobs(JOBS)
-    membership = Membership(fleet=LiveFleet(arms=ARMS), choose=lambda observation, arm_index: 0)
+    membership = Membership(fleet=LiveFleet(arms=arms), choose=lambda observation, arm_index: 0)
     participant = Participant(arm, granter, membership, boot=1, rng=Random(0))
-    participant.set_present(frozenset(ARMS))
-    for name in ARMS:
+    participant.set_present(frozenset(arms))
+    for name in arms:
         participant.apply_state(name, State(name, 1, 0.0, "idle", (30.0,) * 7, 30.0))
     return participant
+
+
+@pytest.fixture
+def participant():
+    return make_participant()
 
 
 @pytest.mark.parametrize("period_s", [0.2, 2.0, math.inf], ids=["often", "seldom", "when it says"])
@@ -55,3 +59,29 @@ def test_it_chooses_within_a_window_though_its_peers_never_bid_for_the_same_jobs
         real_s = min(real_s + period_s, peers_s, participant.wake_s(real_s))
     longest_s = 2 * BID_S + Timing().window_s + (period_s if period_s < math.inf else 0.0)
     assert participant.rounds >= int(20.0 / longest_s)
+
+
+@pytest.mark.parametrize(
+    ("able_before", "refused_before", "reason"),
+    [
+        ((), (), "No arm that was asked can do it, and arm_3, arm_4 are not present."),
+        (("arm_3",), (), "No arm that was asked can do it, and arm_3, arm_4 are not present."),
+        ((), ("arm_3",), "No arm that was asked can do it, and arm_4 is not present."),
+        ((), ("arm_3", "arm_4"), "No arm can do it: arm_0: no; arm_1: no; arm_2: no; arm_3: no; arm_4: no."),
+    ],
+)
+def test_a_job_that_only_absent_arms_may_do_names_them(able_before, refused_before, reason):
+    """Three of five arms are present and refuse the job; those that left have bid for it before, or not."""
+    arms, job = tuple(f"arm_{k}" for k in range(5)), JOBS[0]
+    refusing = (JobEstimate(job.name, reason="no"),)
+    participant = make_participant(arms, lambda jobs, *_: refusing)
+    for number, (peer, offers) in enumerate(
+        [*((arm, estimate([job])) for arm in able_before), *((arm, refusing) for arm in refused_before)]
+    ):
+        participant.apply_bid(Bid(peer, number, 0.0, capacity=1, estimates=offers, open_count=1), 0.0)
+    participant.set_present(frozenset(arms[:3]))
+    for peer in arms[1:3]:
+        participant.apply_bid(Bid(peer, 9, 10.0, capacity=1, estimates=refusing, open_count=1), 10.0)
+    participant.tick(10.0, 10.0)
+    (status,) = participant.status_of([participant.book.jobs[job.name]], 10.0)
+    assert status.reason == reason

@@ -74,6 +74,7 @@ FLEET = FleetSnapshot(
         JobStatus("j", "waiting", release_s=0.0, accepted_s=40.0, reason="It waits until b is out of the way."),
         JobStatus("k", "waiting", reason=NOT_OFFERED.format(16)),
     ),
+    time_s=100.0,
     speed=60.0,
     changes={"finished": 5000},
 )  # fmt: skip

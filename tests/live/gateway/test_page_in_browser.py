@@ -13,6 +13,7 @@ from playwright.sync_api import expect, sync_playwright
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
+from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import (
     Cancel,
     Change,
@@ -191,6 +192,28 @@ def test_a_job_is_changed_and_settled_and_the_space_of_an_absent_arm_freed(serve
     confirm(page)
     answer(page).to_contain_text("gone: its space is free")
     assert fleet.requests[-1] == ClearRequest("gone", "ann")
+
+
+def test_a_visitor_with_a_wrong_clock_changes_no_time_and_has_no_row_once_it_left(served, fleet, router, open_page):
+    """The fleet is in its first hours, and the clock of the visitor shows 500 h."""
+    page = open_page(served)
+    rows, summary = page.locator("#arms tbody tr"), page.locator("#summary")
+    with BusClient(router, "f") as visitor:
+        visitor.declare_token(keys.of_arm("f", "visitor", "alive"))
+        publish = visitor.publisher(keys.of_arm("f", "visitor", "state"), State)
+        publish(State("visitor", 1, 1.8e6, "idle", (30.0,) * 7, 30.0))
+        expect(rows).to_have_count(3)
+        for _ in range(2):  # what the first one brought is drawn
+            with page.expect_response("**/v4/fleet*"):
+                pass
+        expect(summary).not_to_contain_text("500:00")
+        publish(State("visitor", 2, 1.8e6, "idle", (30.0,) * 7, 30.0, leaving=True))
+        wait_until(lambda: served.ask("GET", "/v4/fleet")[2]["arms"][2]["leaving"])
+    expect(rows).to_have_count(2)
+    expect(summary).to_contain_text("2 of 2 arms present, 1 left.")
+    page.reload()
+    expect(summary).to_contain_text("2 of 2 arms present, 1 left.")
+    expect(rows).to_have_count(2)
 
 
 def test_a_fault_is_told_in_words_and_reset(served, fleet, open_page):

@@ -2,6 +2,7 @@
 
 from datetime import UTC, datetime
 from itertools import product
+from unittest.mock import MagicMock
 
 import msgspec
 import pytest
@@ -11,7 +12,9 @@ from hypothesis import strategies as st
 from fleet.bus.protocol.auction import JobStatus, Status
 from fleet.bus.protocol.operator import Alarm
 from fleet.errors import Refused
+from fleet.live.clock import FleetClock
 from fleet.live.monitor.alarms import HOLD_S, AlarmList
+from fleet.live.monitor.async_bridge import AsyncBridge
 from fleet.live.monitor.health import Finding, check_arm, check_awards, check_connection, check_jobs
 from fleet.live.monitor.snapshot import MAX_ALARMS, FleetSnapshot, FleetView
 from scenarios.live.recorder import Recorder
@@ -306,6 +309,14 @@ def test_a_listener_says_who_does_not_reply_and_why_nobody_awards_jobs():
     (lost,) = check_connection(view.snapshot(20.0))
     assert (lost.kind, lost.since_s) == ("connection", 2.0)
     assert lost.what.endswith("What is shown is from before, 2 s ago.")
+    for arm in "ab":
+        view.update(arm, state(arm, leaving=True), 18.0)
+    assert [(each.level, each.kind) for each in check_connection(view.snapshot(20.0))] == [("note", "")]
+    view.set_token("arm", "a", False)
+    view.set_token("arm", "b", False)
+    late = view.snapshot(60.0)
+    assert (late.arms, [each.level for each in check_connection(late)]) == ((), ["note"])
+    view.update("a", state("a", tick=2), 18.0)
     view.expiry = "The certificate of 'm' expired."
     assert check_connection(view.snapshot(20.0))[0].what.startswith("The certificate of 'm' expired. What is shown is")
 
@@ -328,3 +339,25 @@ def test_an_absence_raises_an_alarm_once_it_lasts_and_the_end_of_the_shift_raise
     jobs = (JobStatus("a", "unfinished", shift_ended=True), JobStatus("b", "unfinished", reason="An arm stopped."))
     fleet = FleetSnapshot("f", (), (), {}, jobs)
     assert [finding.subject for finding in check_jobs(fleet)] == ["b"]
+
+
+@pytest.mark.parametrize(("lost_s", "kinds"), [(102.0, {"connection"}), (104.5, {"absent", "connection"})])
+def test_no_absence_begins_while_there_is_no_connection(lost_s, kinds):
+    """The token of an arm goes at 100 s; an absence is an alarm after 3 s, and the connection is lost before or after.
+
+    The clock of the fleet, at speed 60, goes on: the alarm begins when the connection was lost.
+    """
+    link = MagicMock(fleet="f", participant="", complaints=lambda _: {})
+    link.objection.return_value = ""
+    bridge = AsyncBridge(link, lambda: None)
+    bridge._loop, view = MagicMock(), bridge._listener.view
+    view.clock = FleetClock(60.0).set_to(0.0, 0.0, 0.0)
+    view.set_token("arm", "a", True)
+    view.update("a", state("a", 6000.0), 99.9)
+    view.set_token("arm", "a", False)
+    for step in range(100, 112):
+        view.lost_s = lost_s if step >= lost_s else None
+        bridge._check_alarms(float(step))
+    lasting = [alarm for alarm in bridge._alarms.alarms.values() if alarm.ended_s is None]
+    assert {alarm.kind for alarm in lasting} == kinds
+    assert [alarm.began_s for alarm in lasting if alarm.kind == "connection"] == [pytest.approx(60.0 * lost_s)]

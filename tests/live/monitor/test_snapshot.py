@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from fleet.bus.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import ArmEvent, JobState, JobStatus, Status, StatusRequest
+from fleet.bus.protocol.auction import ArmEvent, Clock, ClockRequest, JobState, JobStatus, Status, StatusRequest
 from fleet.bus.protocol.messages import DifficultyScores
 from fleet.bus.router import Router
+from fleet.live.clock import FleetClock
 from fleet.live.monitor import snapshot as listener_module
 from fleet.live.monitor import snapshot as snapshot_module
 from fleet.live.monitor.async_bridge import HISTORY, NEWEST_ONLY, EventFeed
@@ -19,7 +20,7 @@ from fleet.live.monitor.health import check_jobs
 from fleet.live.monitor.snapshot import FRESH_S, FleetListener, FleetView, JobScore
 from tests.live.many_jobs import ManyJobs, entries
 from tests.live.monitor.messages import result, stands, state
-from tests.waiting import serve_until, serving, wait_until
+from tests.waiting import PATIENCE_S, serve_until, serving, wait_until
 
 
 @given(token=st.booleans(), age_s=st.floats(0.0, 10.0), spoke=st.booleans())
@@ -48,7 +49,7 @@ def scores(time_s, **difficulty):
 @pytest.mark.parametrize(("speed", "age_s"), [(None, 2.0), (10.0, 7.0), (1.0, 61.0)])
 def test_scores_from_a_cache_are_as_old_as_the_arm_made_them(speed, age_s):
     """Made at 40 s of fleet time, they arrive at 10 s; the state of 100 s arrives at 11 s; now it is 12 s."""
-    seen = FleetView("f", speed=speed)
+    seen = FleetView("f", clock=speed and FleetClock(speed))
     seen.update("a", scores(40.0, x=0.5), 10.0)
     seen.update("a", state(time_s=100.0), 11.0)
     assert seen.snapshot(12.0).arms[0].difficulty_age_s == pytest.approx(age_s)
@@ -59,6 +60,29 @@ def test_scores_of_jobs_that_have_ended_are_not_shown():
     seen.update("a", scores(1.0, x=0.5, y=None, z=0.2), 0.0)
     seen.update_jobs(stands(1.0, "x"), 0.0)
     assert seen.snapshot(0.0).arms[0].scores == {"y": JobScore(), "z": JobScore(difficulty=0.2)}
+
+
+TIMES_S = {"a": 100.0, "b": 100.0, "ahead": 5100.0}
+
+
+@pytest.mark.parametrize("replied", [False, True])
+@pytest.mark.parametrize("left", [False, True])
+def test_fleet_time_is_that_of_the_fleet_though_one_arm_has_a_wrong_clock(left, replied):
+    """All states came at 10 s; a reply gives 90 s at the real second 9, at speed 2; now it is 13 s."""
+    seen = FleetView("f", clock=FleetClock(2.0).set_to(9.0, 9.0, 90.0) if replied else None)
+    for name, time_s in TIMES_S.items():
+        seen.set_token("arm", name, True)
+        seen.update(name, state(name, time_s), 10.0)
+    if left:
+        seen.set_token("arm", "ahead", False)
+        seen.set_token("arm", "b", False)
+    assert seen.snapshot(13.0).time_s == (98.0 if replied else 100.0)
+
+
+def test_fleet_time_goes_on_after_all_have_left_and_is_unknown_of_nobody():
+    seen = FleetView("f", clock=FleetClock(60.0).set_to(0.0, 0.0, 600.0))
+    assert seen.snapshot(10.0).time_s == 1200.0
+    assert FleetView("f").snapshot(10.0).time_s is None
 
 
 def test_a_token_change_is_reported_once():
@@ -257,6 +281,17 @@ def test_a_listener_counts_only_the_jobs_of_the_present_fleet(monkeypatch):
         for fleet in ({"finished": 2}, {"waiting": 1}):
             serve_until(lambda fleet=fleet: seen.view.snapshot(0.0).counts == fleet, seen, auctioneer)
             del fleets[:-1]
+
+
+def test_a_listener_asks_for_the_time_of_the_fleet():
+    """The reply is read within the seconds that the test may take."""
+    with Router() as router, BusClient(router.endpoint, "f") as link, BusClient(router.endpoint, "f") as auctioneer:
+        auctioneer.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(5000.0, 2.0))
+        seen = FleetListener(link)
+        serve_until(lambda: seen.view.clock is not None, seen, auctioneer)
+        now = seen.view.snapshot(time.monotonic())
+        assert now.speed == 2.0
+        assert 5000.0 <= (now.time_s or 0.0) < 5000.0 + 2.0 * PATIENCE_S
 
 
 def test_a_listener_finds_an_unfinished_job_among_300_finished_ones_without_results(monkeypatch):

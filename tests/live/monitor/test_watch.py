@@ -30,7 +30,7 @@ def shown(now, width=80, height=24, events=(), **more):
 
 
 def fleet_of(arms):
-    return FleetSnapshot("f", tuple(arms), (), {"waiting": 2, "finished": 1}, ())
+    return FleetSnapshot("f", tuple(arms), (), {"waiting": 2, "finished": 1}, (), time_s=3661.0)
 
 
 SCORES = {"x": JobScore(52.0, 0.02), "y": JobScore(), "z": JobScore(41.0, 0.25, 0.5)}
@@ -55,6 +55,14 @@ def test_the_screen_shows_the_fleet():
 
 
 EXPIRY = "The certificate of 'monitor' expired on 2026-11-29 21:00 UTC, so it has no connection: renew it."
+
+
+def test_a_fleet_of_which_nobody_is_present_has_no_time():
+    assert "1:01:01" not in shown(fleet_of([arm_now(token=False, present=False)]))
+
+
+def test_the_heading_counts_the_arms_that_left_in_order_apart():
+    assert "1 of 1 arms present, 2 left" in shown(replace(fleet_of([arm_now()]), left=("b", "c")))
 
 
 def test_the_screen_tells_why_there_is_no_connection():
