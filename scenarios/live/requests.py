@@ -190,8 +190,15 @@ def read_jobs(file: str, begin: str = "") -> dict[int, JobSpec]:
         raw = sys.stdin.buffer.read() if file == "-" else Path(file).read_bytes()
     except OSError as error:
         raise FleetError(f"Cannot read '{file}': {error.strerror}.") from error
+    whole = None
+    with suppress(msgspec.DecodeError, UnicodeDecodeError, RecursionError):  # else a job on each line
+        whole = msgspec.json.decode(raw)
+    if isinstance(whole, dict) and "jobs" in whole:
+        raise FleetError(f"{name} is a Submission, the body of an HTTP request: give its list of jobs alone, and --by.")
     if raw.lstrip().startswith(b"["):
         jobs = dict(enumerate(_decode(raw, list[JobSpec], name)))
+    elif isinstance(whole, dict) and b"\n" in raw.strip():
+        jobs = {1: _decode(raw, JobSpec, name)}
     else:
         lines = enumerate(raw.splitlines(), start=1)
         jobs = {number: _decode(line, JobSpec, f"{name}, line {number}") for number, line in lines if line.strip()}

@@ -435,6 +435,8 @@ def test_jobs_are_read_from_lines_or_a_list(tmp_path):
     listed.write_text(json.dumps([HOLD, other], indent=1), encoding="utf-8")
     assert {line: job.name for line, job in read_jobs(str(lines)).items()} == {1: "a", 3: "b"}
     assert [*read_jobs(str(lines)).values()] == [*read_jobs(str(listed)).values()]
+    listed.write_text(json.dumps(HOLD, indent=1), encoding="utf-8")
+    assert [job.name for job in read_jobs(str(listed)).values()] == ["a"]
 
 
 @pytest.mark.parametrize(
@@ -448,6 +450,10 @@ def test_jobs_are_read_from_lines_or_a_list(tmp_path):
         (json.dumps([HOLD | {"payloadkg": 1}]), "Unknown field 'payloadkg' in [0]; did you mean 'payload_kg'?"),
         ("{", "line 1: Input data was truncated."),
         ("\n", "contains no jobs."),
+        (
+            json.dumps({"jobs": [HOLD], "by": "ann"}),
+            " is a Submission, the body of an HTTP request: give its list of jobs",
+        ),
         ("\xff", "line 1: "),
     ],
 )
