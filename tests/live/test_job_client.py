@@ -210,7 +210,8 @@ def test_the_commands_and_the_example_steer_a_fleet(port, tmp_path):
     assert command("arm", "pause", "arm_0", "--end")[0] == 2
     assert command("job", "cancel", "one") == (0, "one: cancelled, 0 of 1 cycles.\n")
     assert command("job", "cancel", "one") == (0, "one: cancelled, 0 of 1 cycles. It is cancelled.\n")
-    assert command("job", "change", "two", "--due", 900, "--value", 3) == (0, "two: waiting, 0 of 1 cycles.\n")
+    changed = "two: waiting, 0 of 1 cycles, due at 0:15:00, value 3.\n"
+    assert command("job", "change", "two", "--due", 900, "--value", 3) == (0, changed)
     code, said = command("job", "settle", "two", "done")
     assert (code, "only an unfinished job can be settled" in said) == (2, True), said
     code, said = example("cancel", "two")
