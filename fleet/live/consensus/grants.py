@@ -97,7 +97,10 @@ class Granter:
             raise Refused(f"Stale claim {claim.number} from '{claim.arm}' (latest {last}).")
         if claim.number // NUMBERS_PER_BOOT > last // NUMBERS_PER_BOOT:  # by it, that arm notices an older copy
             book.record(ClaimNumbered(claim.arm, claim.number))
-        self.add_jobs(claim.jobs)
+        try:
+            self.add_jobs(claim.jobs)
+        except JournalFull as error:  # the peer sends them again, and needs a lease meanwhile
+            _LOG.error("Could not persist jobs of '%s': %s", claim.arm, error)
         for outcome in claim.outcomes:
             self.apply_outcome(outcome)
         kept = {entry.award for entry in claim.entries}
@@ -431,7 +434,8 @@ class Claimant:
             _LOG.warning("Nothing is claimed: %s", error)
             return None
         self._corrections.clear()
-        self._new_jobs.clear()
+        self._new_jobs = dict(list(self._new_jobs.items())[len(jobs) :])
+        self._due = bool(self._new_jobs)
         self._operations.clear()
         self._sent = {number: sent for number, sent in self._sent.items() if number > claim.number - MAX_CLAIMS}
         self._sent[claim.number] = claim, real_s, self._version

@@ -510,3 +510,24 @@ def test_an_arm_with_other_journals_than_its_peers_know_does_not_start(next_star
     own = History("a", "z", claims={"a": 9000000000})  # its own reply says nothing
     with pytest.raises(BusError, match=re.escape(reason)) if reason else nullcontext():
         check_journals("a", next_start * NUMBERS_PER_BOOT, epoch, [own, peer])
+
+
+def test_a_replay_gives_the_time_at_which_a_job_was_abandoned(disk, granter):
+    """Its record names no time."""
+    follower = JobSpec(name="k", kind="hold", places=("y",), after=("j",))
+    granter.add_jobs([JOB, follower])
+    granter.book.pass_time(100.0)
+    granter.add_faults("j", {f"{arm}-1:j": arm for arm in ROSTER})
+    assert granter.book.settled == [(100.0, "j"), (100.0, "k")]
+    replayed = JobBook(is_central=False).replay(disk.records)
+    assert (replayed.settled, replayed.digest) == (granter.book.settled, granter.book.digest)
+
+
+def test_the_next_claims_contain_all_new_jobs():
+    claiming = One()
+    names = [f"job {number}" for number in range(100)]
+    for name in names:
+        claiming.claimant.send_job(JobSpec(name=name, kind="hold", places=("x",)))
+    claims = [claiming.send_claim(0.0) for _ in range(4)]
+    assert [job.name for each in claims for job in each.jobs] == names
+    assert claiming.claimant.claim(frozenset("bcd"), (), 0.0) is None
