@@ -17,6 +17,7 @@ from fleet.bus.protocol.consensus import (
     History,
     JobOutcome,
 )
+from fleet.bus.protocol.messages import MOST_BYTES, encode
 from fleet.errors import BusError, Refused
 from fleet.job import reason_to_give_up
 from fleet.live.arm.awards import ArmHistory, AwardExecutor
@@ -523,11 +524,15 @@ def test_a_replay_gives_the_time_at_which_a_job_was_abandoned(disk, granter):
     assert (replayed.settled, replayed.digest) == (granter.book.settled, granter.book.digest)
 
 
-def test_the_next_claims_contain_all_new_jobs():
-    claiming = One()
-    names = [f"job {number}" for number in range(100)]
+def test_the_next_claims_contain_all_new_jobs_as_many_as_a_message_holds():
+    one, names = One(), [f"job {number}" for number in range(200)]
+    after = tuple(f"{number:0128d}" for number in range(20))
     for name in names:
-        claiming.claimant.send_job(JobSpec(name=name, kind="hold", places=("x",)))
-    claims = [claiming.send_claim(0.0) for _ in range(4)]
+        one.claimant.send_job(JobSpec(name=name, kind="hold", places=("x",), after=after))
+    one.claimant.send_job(JobSpec(name="too large", kind="hold", places=("x",), after=30 * after))
+    claims: list[Claim] = []
+    while len(claims) < 50 and (each := one.claimant.claim(frozenset(), (), 0.0)) is not None:
+        claims.append(each)
     assert [job.name for each in claims for job in each.jobs] == names
-    assert claiming.claimant.claim(frozenset("bcd"), (), 0.0) is None
+    assert all(len(encode(each)) <= MOST_BYTES for each in claims)
+    assert len(claims) < 15
