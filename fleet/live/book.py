@@ -178,6 +178,8 @@ class JobBook(TimedState[BookRecord]):
     _unknown: dict[str, None] = field(default_factory=dict[str, None], repr=False, compare=False)
     """Names of the jobs without a description."""
     _in_order: list[str] | None = field(default=None, repr=False, compare=False)
+    _recorded_s: float = field(default=0.0, repr=False, compare=False)
+    """`time_s` by the records."""
     _outcomes: int = field(default=0, repr=False, compare=False)
     """Checksum of the outcomes."""
     _keep: Callable[..., object] = field(default=lambda *_: None, repr=False, compare=False)
@@ -221,6 +223,8 @@ class JobBook(TimedState[BookRecord]):
         """
         if not records:
             return
+        if max(self._recorded_s, getattr(records[0], "time_s", 0.0)) < self.time_s:  # a replay needs it, too
+            records = (ClockTick(self.time_s), *records)
         self._keep(*records)
         for record in records:
             for change in self.apply(record):
@@ -419,6 +423,7 @@ class JobBook(TimedState[BookRecord]):
         """Apply a record that is durable, and return the changes of job states."""
         time_s = getattr(record, "time_s", self.time_s)
         self.pass_time(time_s)
+        self._recorded_s = self.time_s
         by, changed = self._apply(record)
         offers = record.offers if isinstance(record, Granted) else ()
         changes = [self.note_change(self.status_of(entry), time_s, entry, by, offers) for entry in changed]

@@ -10,16 +10,18 @@ from hashlib import blake2b
 from itertools import accumulate
 from math import inf, isfinite
 from struct import iter_unpack, pack
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, TypeVar
 
 import networkx as nx
 from msgspec import UNSET, Struct
 from msgspec.structs import replace
 
-from fleet.bus.protocol.auction import Admission, JobSpec, JobState, JobStatus, Status
+from fleet.bus.protocol.auction import Admission, JobSpec, JobState, JobStatus
 from fleet.bus.protocol.messages import LISTED_BYTES, State, encode
 from fleet.bus.protocol.operator import Change
 from fleet.errors import Refused, listed, printable
+
+Item = TypeVar("Item", bound=Struct)
 
 MAX_OPEN_JOBS = 10_000
 """Jobs of one auctioneer that are neither finished nor given up; more are refused."""
@@ -390,8 +392,8 @@ class Position(NamedTuple):
             raise Refused(f"StatusRequest.after must be `next` of a reply (got '{printable(text)}').") from None
 
 
-def fitting(reply: Status, statuses: Sequence[JobStatus]) -> tuple[JobStatus, ...]:
-    """Return the first of these statuses, as many as fit into a reply."""
-    sizes = accumulate((len(encode(status)) + 1 for status in statuses), initial=len(encode(reply)))
+def fitting(message: Struct, items: Sequence[Item]) -> tuple[Item, ...]:
+    """Return the first of these items, as many as fit into a message."""
+    sizes = accumulate((len(encode(item)) + 1 for item in items), initial=len(encode(message)))
     next(sizes)
-    return tuple(status for status, size in zip(statuses, sizes, strict=True) if size <= LISTED_BYTES)
+    return tuple(item for item, size in zip(items, sizes, strict=True) if size <= LISTED_BYTES)

@@ -280,9 +280,9 @@ def job_of(award: str) -> str:
     return award.partition(":")[2]
 
 
-def weight_of(outcome: JobOutcome) -> tuple[int, float]:
-    """Return how much an outcome of a job counts: by its kind, then the later one."""
-    return RANKS.index(outcome.outcome), outcome.time_s
+def weight_of(outcome: JobOutcome) -> tuple[int, bool, float]:
+    """Return how much an outcome of a job counts: by its kind, then one of an award, then the later one."""
+    return RANKS.index(outcome.outcome), outcome.award != NO_AWARD, outcome.time_s
 
 
 def outcome_of(report: Report, faults: Faults) -> JobOutcome:

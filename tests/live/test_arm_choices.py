@@ -528,3 +528,71 @@ def test_the_first_arms_of_a_fleet_say_that_they_are_too_few():
         fleet.until(lambda: begun(fleet, "arm_0"))
         assert status_of(fleet).trouble == ""
         assert fleet.submit(job("a", 1))[0].accepted
+
+
+def names_at(fleet: SimulatedFleet) -> list[int]:
+    """Number of jobs that each arm knows."""
+    return [len(jobs) for jobs in fleet.known()]
+
+
+@pytest.mark.parametrize("loses_claims", [False, True])
+def test_every_arm_gets_all_jobs_of_a_submission(fleet_of, loses_claims):
+    """Also those that have no room in a bid, by which they would be noticed as missing, or in one claim."""
+    fleet = fleet_of(True)
+    fleet.run(12.0)
+    send = fleet.world.send
+    if loses_claims:
+        fleet.lose("claim")
+    assert all(each.accepted for each in fleet.submit(*(job(f"job {k}", release_s=1e6) for k in range(100))))
+    fleet.run(2.0)
+    assert names_at(fleet)[1:] == [0, 0] or not loses_claims
+    fleet.world.send = send
+    fleet.run(10.0)
+    fleet.world.processes["arm_0"].kill("is destroyed")
+    assert names_at(fleet) == [100, 100]
+
+
+def test_an_arm_whose_journal_is_full_renews_leases_whatever_jobs_are_submitted(fleet_of):
+    fleet = fleet_of(True)
+    fleet.run(12.0)
+    fleet.submit(job("long", 2, dwell_s=300.0))
+    fleet.until(lambda: bool(fleet.holder("long")))
+    holder = fleet.holder("long")
+    full, absent = (fleet.world.processes[arm] for arm in fleet.arms if arm != holder)
+    absent.kill("is stopped")
+    full.disk.full = True
+    for number in range(40):
+        fleet.submit(job(f"job {number}", release_s=1e6))
+        fleet.run(0.4)
+        assert fleet.holder("long") == holder
+
+
+def test_the_first_arm_accepts_and_carries_out_nothing_before_it_has_joined(fleet_of):
+    """With an older copy of its journals it would accept a job of a name that is taken."""
+    fleet = fleet_of(True)
+    process = fleet.world.processes["arm_0"]
+    fleet.until(lambda: begun(fleet, *fleet.arms))
+    process.kill("is stopped")
+    copy = process.disk.copy()
+    process.start()
+    fleet.submit(job("a", 1))
+    fleet.until(lambda: fleet.is_everywhere("a", "finished"))
+    before = fleet.status("a")
+    process.kill("is stopped")
+    fleet.forget("arm_0")
+    process.disk.restore(copy)
+    fleet.builders["arm_0"].new_epoch = True
+    process.start()
+    fleet.run(1.0)
+    reason = (
+        "'arm_0' has not joined: a majority has to reply what it knows; with --new-epoch, a lease has to end first."
+    )
+    assert status_of(fleet).trouble == reason
+    assert refused(lambda: fleet.submit(job("a", 2, place="elsewhere"))) == f"{reason} Submit it again then."
+    assert refused(lambda: fleet.control(Pause("arm_1"))) == f"{reason} Ask again then."
+    fleet.until(lambda: process.node.work_source._joined)
+    fleet.run(10.0)
+    assert not fleet.submit(job("a", 2, place="elsewhere"))[0].accepted
+    assert {(known["a"].arm, known["a"].award, known["a"].finished_s) for known in fleet.known()} == {
+        (before.arm, before.award, before.finished_s)
+    }

@@ -46,6 +46,8 @@ def test_the_name_of_a_space_states_the_path_and_the_payload_of_a_plan():
         ("one", "a", "other", "c@1.0", True),
         ("one", "a@x", "other", "c@1.0", True),
         ("one", "a@nan", "other", "c@1.0", True),
+        ("one", "a@1e999", "other", "c@1.0", True),
+        ("one", "a@-1", "other", "b@0.5", True),
         ("one", "a@1.0", "other", "unknown@1.0", True),
         ("one", ANYWHERE, "other", "c@1.0", True),
         ("one", "a@1.0", "far", "unknown@1.0", False),

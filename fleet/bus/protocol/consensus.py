@@ -40,7 +40,7 @@ class Bid(FiniteStruct, frozen=True):
     estimates: Annotated[tuple[JobEstimate, ...], msgspec.Meta(max_length=MOST_JOBS)]
     """Estimates of jobs that wait for an arm, as far as this arm has been informed."""
     open_count: Count
-    """Number of jobs without an outcome at this arm."""
+    """Number of jobs without an outcome at this arm. A peer with more of them sends some."""
     open_jobs: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
     """The first jobs without an outcome, by release and name. A peer that has an outcome, or a missing job, sends
     it."""
@@ -100,7 +100,7 @@ class Claim(msgspec.Struct, frozen=True):
     entries: Annotated[tuple[ClaimEntry, ...], msgspec.Meta(max_length=MOST_JOBS)]
     outcomes: Annotated[tuple[JobOutcome, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
     jobs: Annotated[tuple[JobSpec, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
-    """Submitted jobs that a peer lacks, as its last messages show."""
+    """Jobs that the arm has accepted, and those that a peer lacks, as its last messages show."""
     operations: Annotated[tuple[Operation, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
     """Operator requests that a peer lacks, as its last messages show. Of several requests that set the same value, the
     latest applies: by `time_s`, then by name."""

@@ -33,7 +33,7 @@ from fleet.job import reason_to_give_up
 from fleet.live.arm.awards import REVOKED, ActiveAward, AwardExecutor
 from fleet.live.book import MAX_SETTLED, JobBook
 from fleet.live.epochs import adopted, committed_job
-from fleet.live.job_rules import MAX_OPEN_JOBS
+from fleet.live.job_rules import MAX_OPEN_JOBS, fitting
 from fleet.live.journal import JobsAccepted, Progress, Released, SpaceTaken
 from fleet.live.leases import Timing, clear, expire, renewal
 from fleet.live.records import (
@@ -97,7 +97,10 @@ class Granter:
             raise Refused(f"Stale claim {claim.number} from '{claim.arm}' (latest {last}).")
         if claim.number // NUMBERS_PER_BOOT > last // NUMBERS_PER_BOOT:  # by it, that arm notices an older copy
             book.record(ClaimNumbered(claim.arm, claim.number))
-        self.add_jobs(claim.jobs)
+        try:
+            self.add_jobs(claim.jobs)
+        except JournalFull as error:  # the peer sends them again, and needs a lease meanwhile
+            _LOG.error("Could not persist jobs of '%s': %s", claim.arm, error)
         for outcome in claim.outcomes:
             self.apply_outcome(outcome)
         kept = {entry.award for entry in claim.entries}
@@ -277,7 +280,7 @@ PENDING_S = 2.0
 LOST = "The journal of its arm was lost after it had permission to commit."
 """Why a job is unfinished of which the arm itself has no record."""
 MAX_CORRECTIONS = 32
-"""In one claim."""
+"""Outcomes and requests of people in one claim."""
 MAX_CLAIMS = 64
 """Latest claims whose replies count."""
 NUMBERS_PER_BOOT = 1_000_000_000
@@ -421,9 +424,11 @@ class Claimant:
         entries, outcomes = self._entries()
         corrections = list(self._corrections.values())[: min(MAX_CORRECTIONS, MOST_JOBS - len(outcomes))]
         self._number += 1
-        jobs = tuple(self._new_jobs.values())[:MAX_CORRECTIONS]
         operations = tuple(self._operations.values())[:MAX_CORRECTIONS]
-        claim = Claim(self.arm, self._number, tuple(entries), (*outcomes, *corrections), jobs, operations, space)
+        claim = Claim(self.arm, self._number, tuple(entries), (*outcomes, *corrections), (), operations, space)
+        new = list(self._new_jobs.items())
+        if new:
+            claim = replace(claim, jobs=fitting(claim, [job for _, job in new[:MOST_JOBS]]))
         self._claimed_s, self._due = real_s, False
         try:
             own_reply = self.granter.answer_claim(claim, real_s)
@@ -431,7 +436,8 @@ class Claimant:
             _LOG.warning("Nothing is claimed: %s", error)
             return None
         self._corrections.clear()
-        self._new_jobs.clear()
+        self._new_jobs = dict(new[max(1, len(claim.jobs)) :])  # one that never fits delays no other
+        self._due = bool(self._new_jobs)
         self._operations.clear()
         self._sent = {number: sent for number, sent in self._sent.items() if number > claim.number - MAX_CLAIMS}
         self._sent[claim.number] = claim, real_s, self._version

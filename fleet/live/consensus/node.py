@@ -42,6 +42,8 @@ PATIENCE_S = 20.0
 """Real seconds that a majority waits for the other arms before it starts the fleet's time."""
 LAST_S = 10.0
 """Real seconds after the end of the shift that an arm waits at most for last cycles, its own and its peers'."""
+NOT_JOINED = "'{}' has not joined: a majority has to reply what it knows; with --new-epoch, a lease has to end first."
+"""Why an arm accepts no jobs."""
 NOT_YET_S = 1e9
 """Real seconds until the fleet's time would begin if no arm started it: never."""
 
@@ -357,7 +359,9 @@ class ConsensusNode(JobDesk):
         if failure := self._recorder.failure:
             return f"{self._name} accepts and takes no jobs: {failure}"
         present, roster = self._present | {self._name}, self.participant.granter.roster
-        return TOO_FEW.format(len(present), len(roster), self._majority) if self._lacks_majority else ""
+        if self._lacks_majority:
+            return TOO_FEW.format(len(present), len(roster), self._majority)
+        return "" if self._joined else NOT_JOINED.format(self._name)
 
     def _entries(self) -> list[JobEntry]:
         return self.participant.entries(job for _, job in self._stream)
@@ -367,7 +371,8 @@ class ConsensusNode(JobDesk):
 
     def _submit(self, submission: Submission) -> SubmissionReply:
         self._check_first()  # it alone decides: the others get what it accepts with its next claim
-        if self._lacks_majority:  # the others may accept another job of the same name
+        # Without a majority the others may accept another job of the same name; an older copy lacks names.
+        if self._lacks_majority or not self._joined:
             raise RefusedForNow(f"{self._trouble()} Submit it again then.")
         later = {job.name: job for _, job in self._stream}
         admissions = self.book.admit(submission.jobs, self.time_s, later)
@@ -389,7 +394,7 @@ class ConsensusNode(JobDesk):
 
     def _control(self, request: ControlRequest) -> Controlled:
         self._check_first()
-        if not self._begun:
+        if not (self._begun and self._joined):
             raise RefusedForNow(f"{self._trouble()} Ask again then.")
         return self.participant.control(request, self.time_s, (job for _, job in self._stream))
 

@@ -18,6 +18,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import islice
 from random import Random
 
 from msgspec.structs import replace
@@ -158,7 +159,7 @@ class Participant:
         before = self._bids.get(bid.arm)
         if bid.arm not in self.granter.roster or (before is not None and bid.number < before[0].number):
             return
-        if before is not None and bid.number // NUMBERS_PER_BOOT > before[0].number // NUMBERS_PER_BOOT:
+        if before is None or bid.number // NUMBERS_PER_BOOT > before[0].number // NUMBERS_PER_BOOT:
             self.claimant.repeat_for(bid.arm)
         self._bids[bid.arm], self._granted[bid.arm] = (bid, real_s), self.granter.granted_to(bid.arm)
         self._refusals.note(bid)
@@ -175,7 +176,8 @@ class Participant:
         for job in bid.open_jobs:
             if (outcome := self.granter.known_outcome(job)) is not None:
                 self.claimant.send_outcome(outcome)
-        if bid.digest == book.digest:
+        jobs = [spec for name in self.open_jobs() if (spec := book.jobs[name].original) is not None]
+        if bid.digest == book.digest and bid.open_count >= len(jobs):
             self._behind_s.pop(bid.arm, None)
         elif real_s >= self._behind_s.setdefault(bid.arm, real_s) + 2 * BID_S:
             outcomes = [entry.outcome for entry in book.jobs.values() if entry.outcome is not None]
@@ -186,11 +188,13 @@ class Participant:
                     self.claimant.send_outcome(outcomes[self._corrected % len(outcomes)])
                 if operations:
                     self.claimant.send_operation(operations[self._corrected % len(operations)])
+                if bid.open_count < len(jobs):
+                    self.claimant.send_job(jobs[self._corrected % len(jobs)])
         last = book.jobs.get(bid.open_jobs[-1]) if len(bid.open_jobs) == MAX_BID_JOBS else None
         end = (math.inf, "") if last is None or last.spec is None else job_order(last.spec)
-        for job in self.open_jobs():
-            if job not in bid.open_jobs and (spec := book.jobs[job].original) is not None and job_order(spec) < end:
-                self.claimant.send_job(spec)
+        missing = (job for job in jobs if job.name not in bid.open_jobs and job_order(job) < end)
+        for job in islice(missing, MAX_BID_JOBS):
+            self.claimant.send_job(job)
 
     def control(self, request: ControlRequest, time_s: float, later: Iterable[JobSpec] = ()) -> Controlled:
         """Carry out a request of a person, as `carry_out`; the peers get it.

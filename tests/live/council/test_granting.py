@@ -17,6 +17,7 @@ from fleet.bus.protocol.consensus import (
     History,
     JobOutcome,
 )
+from fleet.bus.protocol.messages import MOST_BYTES, encode
 from fleet.errors import BusError, Refused
 from fleet.job import reason_to_give_up
 from fleet.live.arm.awards import ArmHistory, AwardExecutor
@@ -510,3 +511,28 @@ def test_an_arm_with_other_journals_than_its_peers_know_does_not_start(next_star
     own = History("a", "z", claims={"a": 9000000000})  # its own reply says nothing
     with pytest.raises(BusError, match=re.escape(reason)) if reason else nullcontext():
         check_journals("a", next_start * NUMBERS_PER_BOOT, epoch, [own, peer])
+
+
+def test_a_replay_gives_the_time_at_which_a_job_was_abandoned(disk, granter):
+    """Its record names no time."""
+    follower = JobSpec(name="k", kind="hold", places=("y",), after=("j",))
+    granter.add_jobs([JOB, follower])
+    granter.book.pass_time(100.0)
+    granter.add_faults("j", {f"{arm}-1:j": arm for arm in ROSTER})
+    assert granter.book.settled == [(100.0, "j"), (100.0, "k")]
+    replayed = JobBook(is_central=False).replay(disk.records)
+    assert (replayed.settled, replayed.digest) == (granter.book.settled, granter.book.digest)
+
+
+def test_the_next_claims_contain_all_new_jobs_as_many_as_a_message_holds():
+    one, names = One(), [f"job {number}" for number in range(200)]
+    after = tuple(f"{number:0128d}" for number in range(20))
+    for name in names:
+        one.claimant.send_job(JobSpec(name=name, kind="hold", places=("x",), after=after))
+    one.claimant.send_job(JobSpec(name="too large", kind="hold", places=("x",), after=30 * after))
+    claims: list[Claim] = []
+    while len(claims) < 50 and (each := one.claimant.claim(frozenset(), (), 0.0)) is not None:
+        claims.append(each)
+    assert [job.name for each in claims for job in each.jobs] == names
+    assert all(len(encode(each)) <= MOST_BYTES for each in claims)
+    assert len(claims) < 15

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from fleet.bus.protocol.auction import JobEstimate, JobSpec, PlanQuote
-from fleet.bus.protocol.consensus import Bid
+from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
 from fleet.bus.protocol.messages import State
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.book import JobBook
@@ -85,3 +85,19 @@ def test_a_job_that_only_absent_arms_may_do_names_them(able_before, refused_befo
     participant.tick(10.0, 10.0)
     (status,) = participant.status_of([participant.book.jobs[job.name]], 10.0)
     assert status.reason == reason
+
+
+def test_it_repeats_its_claim_with_the_first_bid_of_a_peer_that_has_replied_before(participant):
+    """That peer may have started again since, without its journals."""
+    real_s = 0.0
+    while real_s < 5.0:
+        participant.tick(real_s, real_s)
+        for claim in [each for each in participant.out if isinstance(each, Claim)]:
+            for peer in ARMS[1:]:
+                participant.claimant.apply_reply(ClaimReply(peer, claim.number, 10.0), real_s)
+        participant.out.clear()
+        real_s += 0.1
+    names = tuple(job.name for job in JOBS)
+    participant.apply_bid(Bid("arm_1", 1, real_s, 1, estimate(JOBS), len(names), names), real_s)
+    participant.tick(real_s, real_s)
+    assert any(isinstance(each, Claim) for each in participant.out)
