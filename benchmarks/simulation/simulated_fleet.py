@@ -180,6 +180,7 @@ class Fleet:
         nodes = {arm: node for arm in self.arms if (node := self.node(arm)) is not None}
         self._excused |= {(name, each.award.award) for node in nodes.values() for each in node.executor.active}
         central = None if self.alone else self.node(AUCTIONEER)
+        self._excused |= {(name, award) for award in central.book.open} if central else set()  # an award may be late
         for source in [node.work_source for node in nodes.values()] if self.alone else [central] if central else []:
             jobs, accepted = source.book.jobs.items(), self.submitter.accepted
             self.doubtful |= {job for job, entry in jobs if any(grant.may_commit for grant in entry.grants.values())}
