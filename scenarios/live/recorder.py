@@ -264,7 +264,8 @@ class Recorder:
         for gap in self.missing:
             own = gap.sender == series.sender and gap.first <= number <= gap.last
             own &= gap.epoch == series.epoch or (not series.continues and "" in (gap.epoch, series.epoch))
-            if own and (series.continues or gap.after_s <= time_s <= gap.time_s):
+            # The first event of a start may have the time of a clock that is not set yet; its number tells the start.
+            if own and (series.continues or series.first > 1 or gap.after_s <= time_s <= gap.time_s):
                 self.missing.remove(gap)
                 if gap.first < number:
                     self.missing.append(structs.replace(gap, last=number - 1, time_s=time_s))

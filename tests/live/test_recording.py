@@ -36,7 +36,7 @@ from fleet.bus.protocol.operator import (
 )
 from fleet.bus.router import Router
 from fleet.errors import FleetError
-from fleet.events import Event
+from fleet.events import EVENTS_PER_BOOT, Event
 from fleet.live.job_rules import EXPIRED
 from fleet.robot import ThermalLimits
 from scenarios.live.recorder import SWEEP_S, GapFetcher, Recorder, record
@@ -200,6 +200,17 @@ def test_a_fetched_result_that_is_later_than_the_next_one_is_recorded_once(tmp_p
     sent = [replace(result(number), time_s=time_s) for number, time_s in enumerate((10.0, 30.0, 20.0))]
     recorded(tmp_path, sent[0], sent[2], sent[1], *sent, status="finished")
     assert sorted(read_parts(tmp_path, "results")["number"].to_pylist()) == [0, 1, 2]
+    assert read_parts(tmp_path, "gaps").num_rows == 0
+
+
+def test_the_first_event_of_a_start_is_recorded_though_the_clock_of_its_arm_was_not_set_yet(tmp_path):
+    """It is fetched after the ones that follow it."""
+    start = 2 * EVENTS_PER_BOOT
+    times_s = {1: 50.0, start + 1: 9.5, start + 2: 60.0, start + 3: 70.0}
+    sent = {number: replace(event("arm_0", number), time_s=time_s) for number, time_s in times_s.items()}
+    order = (1, start + 3, start + 1, start + 2, start + 1)
+    recorded(tmp_path, *(sent[number] for number in order), status="finished")
+    assert sorted(read_parts(tmp_path, "events")["number"].to_pylist()) == sorted(times_s)
     assert read_parts(tmp_path, "gaps").num_rows == 0
 
 
