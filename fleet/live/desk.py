@@ -126,6 +126,6 @@ class JobDesk(ABC):
             raise Refused(f"'{self._name}' knows no cell.")
         return self._cell
 
-    def _reply_clock(self, _: ClockRequest) -> Clock:
+    def _reply_clock(self, _: ClockRequest, /) -> Clock:
         self._check_first()
         return Clock(self.time_s, self._speed, self.book.epoch)

@@ -25,7 +25,7 @@ from fleet.live.arm.node import ArmNode
 from fleet.live.book import JobBook
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.grants import NUMBERS_PER_BOOT, Granter
-from fleet.live.consensus.participant import TOO_FEW, Membership, Participant
+from fleet.live.consensus.participant import Membership, Participant
 from fleet.live.desk import JobDesk
 from fleet.live.epochs import REPLY_S, adopted, ask_arms, check_journals, history_of
 from fleet.live.job_rules import SHIFT_ENDED
@@ -331,12 +331,12 @@ class ConsensusNode(JobDesk):
         Raises:
             AnotherReplies: another arm does, or all of them once they have begun.
         """
-        if not (self._begun or self._lacks_majority) or self._name != min(self._present, default=self._name):
+        if not (self._begun or self._too_few) or self._name != min(self._present, default=self._name):
             raise AnotherReplies
 
     @property
-    def _lacks_majority(self) -> bool:
-        return len(self._present | {self._name}) < self._majority
+    def _too_few(self) -> str:
+        return self.participant.too_few(self._present)
 
     @property
     def _present(self) -> frozenset[str]:
@@ -350,18 +350,15 @@ class ConsensusNode(JobDesk):
         """Fleet time; before it goes on, that of the journal."""
         return self._arm.clock.now_s(time.monotonic()) if self._begun else self.book.time_s
 
-    def _reply_clock(self, _: ClockRequest) -> Clock:
+    def _reply_clock(self, request: ClockRequest, /) -> Clock:
         if not self._begun:
             raise AnotherReplies
-        return super()._reply_clock(_)
+        return super()._reply_clock(request)
 
     def _trouble(self) -> str:
         if failure := self._recorder.failure:
             return f"{self._name} accepts and takes no jobs: {failure}"
-        present, roster = self._present | {self._name}, self.participant.granter.roster
-        if self._lacks_majority:
-            return TOO_FEW.format(len(present), len(roster), self._majority)
-        return "" if self._joined else NOT_JOINED.format(self._name)
+        return self._too_few or ("" if self._joined else NOT_JOINED.format(self._name))
 
     def _entries(self) -> list[JobEntry]:
         return self.participant.entries(job for _, job in self._stream)
@@ -372,7 +369,7 @@ class ConsensusNode(JobDesk):
     def _submit(self, submission: Submission) -> SubmissionReply:
         self._check_first()  # it alone decides: the others get what it accepts with its next claim
         # Without a majority the others may accept another job of the same name; an older copy lacks names.
-        if self._lacks_majority or not self._joined:
+        if self._too_few or not self._joined:
             raise RefusedForNow(f"{self._trouble()} Submit it again then.")
         later = {job.name: job for _, job in self._stream}
         admissions = self.book.admit(submission.jobs, self.time_s, later)

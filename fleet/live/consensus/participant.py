@@ -281,15 +281,15 @@ class Participant:
         bids = self._fresh_bids(real_s)
         offered = {offer.job for bid in bids.values() for offer in bid.estimates}
         bidding = self._bidding(bids, offered) if bids else None
-        present, roster, majority = self._present | {self.name}, self.granter.roster, self.claimant.majority
+        too_few = self.too_few(self._present)
         busy, book = self.book.busy_stations(), self.book
 
         def why(job: JobSpec) -> str:
             not_ready = why_not_ready(job, self._time_s, book.is_finished, busy)
             if reason := self._refusal(job.name) or not_ready:
                 return reason
-            if len(present) < majority:
-                return TOO_FEW.format(len(present), len(roster), majority)
+            if too_few:
+                return too_few
             if bidding is None or job.name not in offered:
                 return NOT_OFFERED.format(self._slots)
             return reason_to_wait(bidding, job.name)
@@ -306,6 +306,11 @@ class Participant:
         """Return the status of a job, with the expected finish of one in work."""
         status = self.book.status_of(entry)
         return replace(status, finish_s=finish_s(status, self.states.get(status.arm), self._time_s))
+
+    def too_few(self, present: frozenset[str]) -> str:
+        """Return why these arms, and this one, neither grant nor accept a job; "" if they are a majority."""
+        count, roster, majority = len(present | {self.name}), self.granter.roster, self.claimant.majority
+        return TOO_FEW.format(count, len(roster), majority) if count < majority else ""
 
     @property
     def _absent(self) -> frozenset[str]:
