@@ -361,16 +361,16 @@ def check_space(fleet: FleetSnapshot, reach: str = "") -> list[Finding]:
 def check_auctioneers(fleet: FleetSnapshot, probes: Sequence[ClockProbe], wanted: bool = True) -> list[Finding]:
     """Check that exactly one auctioneer replies; or, where none is wanted, that none is present."""
     names = [auctioneer.auctioneer for auctioneer in fleet.auctioneers if auctioneer.token]
-    listed = ", ".join(names)
+    present = ", ".join(names)
     if len(names) > 1:
-        problem = f"{len(names)} auctioneers are present ({listed}), but a fleet has one: stop all but one."
+        problem = f"{len(names)} auctioneers are present ({present}), but a fleet has one: stop all but one."
     elif not wanted:
-        unwanted = f"Auctioneer {listed} is present, though the fleet should have none."
+        unwanted = f"Auctioneer {present} is present, though the fleet should have none."
         return [Finding("warning", unwanted)] if names else []
     elif any(probe.time_s is not None for probe in probes) or _is_without_auctioneer(fleet):
         return []
     elif names:
-        problem = f"Auctioneer {listed} shows its token but does not answer: its process may hang."
+        problem = f"Auctioneer {present} shows its token but does not answer: its process may hang."
     else:
         problem = (
             "No auctioneer shows a token or answers: jobs are not awarded, and every arm keeps its own time. "

@@ -190,7 +190,7 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
     left_out: dict[str, str] = {}
     """Why an arm is awarded no job for a while, by arm, from the last status reply."""
     time_s: float | None = None
-    """Fleet time, of whoever replies about the jobs; without a reply the median of present arms. None if unknown."""
+    """Fleet time by the last reply of a clock; without one the median of the present arms; None if unknown."""
     speed: float | None = None
     """Fleet seconds per real second."""
     changes: dict[str, int] = {}
@@ -207,8 +207,7 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
     @property
     def last_reply(self) -> tuple[str, float]:
         """Who was the last to send a message about the jobs, "" for nobody, and how many real seconds ago."""
-        ages_s = [(each.heard_age_s, each.auctioneer) for each in self.auctioneers if each.heard_age_s is not None]
-        age_s, name = min(ages_s, default=(self.listened_s, ""))
+        age_s, name = _last_reply(self.auctioneers, self.listened_s)
         return name, age_s
 
 
@@ -395,7 +394,12 @@ class FleetView:
         every = [_arm_snapshot(name, self._arms[name], now_s, speed, ended) for name in sorted(self._arms)]
         needed = {each.arm for each in statuses if each.state not in ("waiting", *ENDED) and not each.shift_ended}
         space, gone = self._space, {arm.arm for arm in every if arm.left}
-        if not self._is_served():  # nobody notes any more that they have freed their space
+        auctioneers = tuple(
+            AuctioneerSnapshot(name, each.token, _age_s(each.heard_s, now_s), each.trouble)
+            for name, each in sorted(self._auctioneers.items())
+        )
+        tokens = {each.auctioneer for each in auctioneers if each.token} | {arm.arm for arm in every if arm.token}
+        if _last_reply(auctioneers)[1] not in tokens:  # nobody notes any more that they have freed their space
             space = {arm: spaces for arm, spaces in space.items() if arm not in gone}
         gone -= needed | space.keys()
         left = {arm.arm for arm in every if arm.arm in gone and (arm.state_age_s or 0.0) > FRESH_S}
@@ -403,10 +407,7 @@ class FleetView:
         now = FleetSnapshot(
             fleet=self.fleet,
             arms=arms,
-            auctioneers=tuple(
-                AuctioneerSnapshot(name, each.token, _age_s(each.heard_s, now_s), each.trouble)
-                for name, each in sorted(self._auctioneers.items())
-            ),
+            auctioneers=auctioneers,
             counts=dict(self._count() + self._others),
             changes=dict(self._changes),
             jobs=_most_urgent(statuses, jobs),
@@ -423,14 +424,6 @@ class FleetView:
         )
         unserved = why_unserved(now)
         return replace(now, arms=tuple(replace(arm, idle=why_idle(arm, waiting, now, unserved)) for arm in now.arms))
-
-    def _is_served(self) -> bool:
-        """Return whether the last one who sent a message about the jobs is present."""
-        heard = [(each.heard_s, name) for name, each in self._auctioneers.items() if each.heard_s is not None]
-        last = max(heard, default=(0.0, ""))[1]
-        return any(
-            each.token for named in (self._auctioneers, self._arms) for name, each in named.items() if name == last
-        )
 
     def _pause(self, request: ControlRequest) -> None:
         """Apply a pause or its end, which the next status reply confirms."""
@@ -607,6 +600,12 @@ def why_idle(arm: ArmSnapshot, waiting: Mapping[str, str], fleet: FleetSnapshot,
 def bids_of(arm: ArmSnapshot, waiting: Container[str]) -> int:
     """Number of the waiting jobs that an arm has said it can do."""
     return sum(job in waiting and score != JobScore() for job, score in arm.scores.items())
+
+
+def _last_reply(auctioneers: Sequence[AuctioneerSnapshot], listened_s: float = 0.0) -> tuple[float, str]:
+    """Age of the last message about the jobs, and its sender; the given age and "" without a message."""
+    ages_s = [(each.heard_age_s, each.auctioneer) for each in auctioneers if each.heard_age_s is not None]
+    return min(ages_s, default=(listened_s, ""))
 
 
 def _median_s(arms: Sequence[ArmSnapshot]) -> float | None:
