@@ -332,7 +332,7 @@ class Maintenance:
         self._world.after(rng.uniform(0.0, 10.0), self._world.processes[AUCTIONEER].kill, "restarts for other arms")
 
     def _free_space(self, arm: str) -> None:
-        """Have the space of an arm that has left freed, as often as needed."""
+        """Free the space of an arm that has left; repeat the request until there is a reply."""
         if arm not in self.absent:
             return
         link: Any = self._world.processes[CLIENT].client

@@ -173,11 +173,11 @@ FORGED = {
         r"test/0007 has a reward of 12, above 11\.9: the finished value 11\.9 less 0 for",
     ),
     "more value than its jobs have": (changed(7, value=1e6), r"of 1e\+06, but 166 of its jobs have at most 691\.2"),
-    "more value than so few jobs have": (
+    "more value than its finished jobs have": (
         changed(7, finished=1),
         r"has a finished value of 691\.2, but 1 of its jobs have at most 5\.09",
     ),
-    "less value than so many jobs have": (
+    "less value than its finished jobs have": (
         changed(7, value=0.0),
         r"has a finished value of 0, but 166 of its jobs have at least 691\.2",
     ),
